@@ -44,7 +44,9 @@ def _commanded(peaks: np.ndarray) -> Data:
     lung = np.full(n, 20.0)
     measured = np.zeros((n, 1, 30))
     u_in = zeros + peaks[:, None]
-    return Data(u_in, zeros, zeros + 0.033, measured, measured + 1.0, lung, lung, np.arange(n) / n)
+    return Data(
+        u_in, zeros, zeros + 0.033, measured, measured + 1.0, lung, lung, np.arange(n) / n, 0 * lung
+    )
 
 
 def test_breaths_that_commands_predict_are_no_event() -> None:

@@ -47,6 +47,7 @@ def simulated(u, out, truth, *, R=20.0, C=20.0, seed=0):
         np.full(n, R),
         np.full(n, C),
         np.linspace(0, 1, n),
+        np.zeros(n),
     )
     rng = np.random.default_rng(seed + 100)
     start = 5.0 + rng.normal(0, 0.3, n)
@@ -78,6 +79,7 @@ def expected(truth, other, u_in, u_out):
         np.full(n, data.R[0]),
         np.full(n, data.C[0]),
         np.ones(n),
+        np.zeros(n),
     )
     here = np.arange(len(data))
     simulator = Predictor(new, paths())

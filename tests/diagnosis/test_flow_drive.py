@@ -109,7 +109,7 @@ def test_functions_get_the_flow_and_learned_simulators_are_refused():
 
 
 def test_the_ventilators_side_is_left_out():
-    terms = flow_drive.lung_side_settings(DEFAULT).search.nonparametric_terms
+    terms = flow_drive.lung_side_settings(DEFAULT, recorded(2)).search.nonparametric_terms
     assert terms is not None
     assert not {"valve_shape", "outlet_shape"} & set(terms)
     assert "flow_shape" in terms
@@ -146,6 +146,41 @@ def test_noise_of_the_flow_is_no_physics(by_volume):
     assert diagnosis.mechanisms == ()
     if not by_volume:  # the derivative of a volume blurs the edges of the flow besides
         assert diagnosis.verdict == "nothing_missing"
+
+
+def test_trapped_gas_drives_the_simulator_too():
+    """What is left of the last breath flows out as the recording of this one begins."""
+    held, breaths = 5.0, recorded(4)
+    assert breaths.flow is not None
+    leaving = held / R * 1e3 * np.exp(-breaths.time / (1e-3 * R * C))
+    lungs = {"R": np.full(4, R), "C": np.full(4, C)}
+    begun = dataclasses.replace(breaths, flow=breaths.flow - leaving, **lungs)
+    whole, _ = flow_drive.with_flow(begun)
+    driven, index = flow_drive.drive_grid(whole)
+    answers = flow_drive.simulate(load_simulators("physics"), whole, driven, index)
+    readings = np.isfinite(driven.pressure)  # by linearity those of the breath without it
+    assert np.abs(answers - driven.pressure)[readings].mean() < 0.05
+
+
+def test_gas_that_leaves_as_breaths_end_is_said():
+    breaths = recorded(4)
+    assert flow_drive.trapped_gas_notes(breaths, np.full(4, R)) == []
+    assert breaths.flow is not None
+    cut = dataclasses.replace(breaths, flow=breaths.flow - 100.0)
+    (note,) = flow_drive.trapped_gas_notes(cut, np.full(4, R))
+    assert "2.1 cmH2O of trapped gas" in note
+
+
+def test_a_breath_without_its_first_flow_or_an_edge_of_it_is_left_out():
+    breaths = recorded(4)
+    assert breaths.flow is not None
+    flow = breaths.flow.copy()
+    flow[0, 0] = np.nan
+    flow[1, 88:93] = np.nan  # inspiration ends here
+    flow[2, 40:45] = np.nan  # where nothing changes
+    whole, notes = flow_drive.with_flow(dataclasses.replace(breaths, flow=flow))
+    assert whole.breath_id.tolist() == [3, 4]
+    assert notes == ["2 breaths without flow, or with gaps in it, were left out."]
 
 
 @pytest.mark.slow

@@ -55,6 +55,18 @@ def test_nothing_enters_through_the_expiratory_valve():
     np.testing.assert_allclose(seen.reading, 4.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("quadratic", [0.0, 8.0])
+def test_a_breath_may_begin_while_gas_flows(quadratic):
+    """Under the flow that it begins with, the pressure goes on by the elastance alone."""
+    R, C, flow, dt = 30.0, 40.0, 114.0, 0.02  # mL/s at a command of 5 %
+    extra = {"turbulent_resistance": {"quadratic": quadratic}} if quadratic else {}
+    with compilation.float64():
+        plant = physics(Lung(R, C), extra).having(initial_flow=flow)
+        u_in = jnp.full((1, T), 5.0)
+        seen = open_loop(plant, jnp.asarray([9.0]), u_in, 0 * u_in, jnp.full((1, T), dt))
+    np.testing.assert_allclose(np.asarray(seen)[0], 9.0 + flow * dt * np.arange(T) / C, atol=1e-6)
+
+
 _RUN = jax.jit(lambda plant, start, *c: open_loop(plant, start, *c))
 
 

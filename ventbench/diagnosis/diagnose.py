@@ -161,7 +161,7 @@ def diagnose(
     excluded = () if patient else ("patient_effort",)
     if by_flow:
         excluded += (*flow_drive.ventilator_side(), *IN_TIME)
-        settings = flow_drive.lung_side_settings(settings)
+        settings = flow_drive.lung_side_settings(settings, breaths)
     intermittent: list[MissingMechanism] = []
     posterior = None  # that of all breaths has all effects
     with compilation.one_blas_thread():
@@ -344,6 +344,10 @@ def _conclude(
     if simulator_effect is not None and term is not None and simulator_effect.name == term.name:
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
     lungs, notes_on_lungs = _lungs(experiment.recorded.select(identifying), alone.fit)
+    if experiment.by_flow:
+        fitted_R = {match.label: match.fitted_R for match in lungs}
+        R = np.array([fitted_R.get(label, np.nan) for label in breaths.lung_ids.tolist()])
+        notes_on_lungs += flow_drive.trapped_gas_notes(breaths, R)
     noise, pressures = conclusion.noise, correction.pressures
     if experiment.by_flow and breaths.flow is not None:
         flow = breaths.flow

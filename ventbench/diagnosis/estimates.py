@@ -30,6 +30,7 @@ from ventbench.physics.nonparametric import NONPARAMETRIC_COMPONENTS, BasisTerm
 from ventbench.system_id import Fit, fit, interval, profile_interval
 from ventbench.system_id.data import Floats
 from ventbench.system_id.predictor import START
+from ventbench.system_id.problem import GIVEN
 from ventbench.task.interfaces import Plant
 
 #: Mechanisms that a periodic input is, by its place, and least weight of one that counts.
@@ -171,7 +172,7 @@ def plants_of(fitted: FittedModel, evaluator: Evaluator) -> dict[str, Plant]:
     values = evaluator.transferred_values(fitted, evaluator.training)
     breathwise = [name for name in library() if varies_by_breath(name)]
     names = [path for path in paths(fitted.names) if path.rpartition(".")[0] not in breathwise]
-    names.remove("position")
+    names = [path for path in names if path not in GIVEN]
     columns = [predictor.names.index(name) for name in names]
     result: dict[str, Plant] = {}
     for breath in np.unique(data.lung, return_index=True)[1]:

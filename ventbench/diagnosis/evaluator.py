@@ -33,6 +33,7 @@ from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.predictor import START
 from ventbench.system_id.problem import (
+    GIVEN,
     Problem,
     make_problem,
     parameter_of,
@@ -336,7 +337,7 @@ class Evaluator:
         same |= ~same.any(axis=1, keepdims=True)
         first = np.argmax(same, axis=1)
         for column, name in enumerate(partition.predictor.names):
-            if name != "position" and name in names and not self.differs_by_breath(name):
+            if name not in GIVEN and name in names and not self.differs_by_breath(name):
                 parameter = parameter_of(name)  # rounding must not carry a value beyond its bound
                 value = fitted.values[first, names.index(name)]
                 values[:, column] = np.clip(value, parameter.low, parameter.high)
@@ -347,24 +348,29 @@ class Evaluator:
         return values
 
     def transferred(self, fitted: FittedModel, partition: Partition) -> dict[str, Floats]:
-        """The same by path, ``(n,)`` each, without the breaths' starts and positions."""
+        """The same by path, ``(n,)`` each, without what the data of a breath give."""
         values = self.transferred_values(fitted, partition)
         names = partition.predictor.names
-        return {name: values[:, k] for k, name in enumerate(names) if name != "position"}
+        return {name: values[:, k] for k, name in enumerate(names) if name not in GIVEN}
 
     def linearised(self, fitted: FittedModel, partition: Partition) -> Linearisation:
         """A model around other breaths with starts, and perhaps gains, of their own."""
         return linearise(*self.refit_breath_parameters(fitted, partition), clip=np.inf)
 
     def mean_square(self, fitted: FittedModel, partition: Partition | None = None) -> float:
-        """Mean square of the open-loop error of breaths from their first readings, cmH2O^2.
+        """Mean square of the open-loop error of breaths, cmH2O^2.
+
+        They start from their first readings, or, where these have no weight, as all tell.
 
         Args:
             fitted: a model.
             partition: the breaths; the held-out ones if None.
         """
-        partition = partition or self.held_out
-        error = self.predict(fitted, partition) - partition.data.measured
+        partition, first = partition or self.held_out, None
+        if not partition.data.weight[:, 0, 0].any():
+            problem, x = self.refit_breath_parameters(fitted, partition)
+            first = problem.values(x)[:, -1]
+        error = self.predict(fitted, partition, first) - partition.data.measured
         return float(np.mean(np.square(error[partition.data.weight > 0.0])))
 
     def breath_term(self, fitted: FittedModel) -> BreathTerm:

@@ -339,6 +339,8 @@ def prepare(
         fitted = unsealed
     sealed, judge = seal(unsealed, uses)
     data = make_data(replace(sealed, u_out=fitted.u_out))
+    if by_flow:
+        data = flow_drive.begun(data, fitted)
     return Experiment(
         recorded,
         unsealed,

@@ -20,7 +20,7 @@ from ventbench.diagnosis.findings import BreathRequest
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.fit import Fit
 from ventbench.system_id.predictor import START, Predictor
-from ventbench.system_id.problem import Problem, parameter_of
+from ventbench.system_id.problem import GIVEN, Problem, parameter_of
 from ventbench.task.lungs import Lung
 
 #: Breaths that are proposed; and expected log-likelihood ratio, nats, below which nothing is.
@@ -96,8 +96,8 @@ def values_of(fitted: Fit, data: Data, lung: NDArray[np.intp], start: float) -> 
     rows = np.resize(lung, len(data))
     values = problem.values(fitted.minimum.x)[rows]
     columns = (*problem.predictor.names, START)
-    if "position" in columns:
-        values[:, columns.index("position")] = data.position
+    for name in set(columns).intersection(GIVEN):
+        values[:, columns.index(name)] = getattr(data, name)
     values[:, -1] = start
     return values
 
@@ -312,6 +312,7 @@ def _data(kinds: Sequence[Family], recorded: Data, recorded_rows: NDArray[np.int
         recorded.R[recorded_rows[0]] * ones,
         recorded.C[recorded_rows[0]] * ones,
         ones,
+        0.0 * ones,
     )
 
 

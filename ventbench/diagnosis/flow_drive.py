@@ -13,11 +13,15 @@ import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.diagnosis.jumps import without_noise
+from ventbench.diagnosis.jumps import noise_of, without_noise
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
+from ventbench.physics.model import Physics, physics
 from ventbench.plants.simulators import OnePlant, PlantsByLung, PlantSimulators, Simulators
+from ventbench.plants.stacking import nominal_plants, open_loop_breaths
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
+from ventbench.system_id.data import Data
+from ventbench.task.interfaces import Plant
 
 #: Parts of the ventilator, on which a prescribed flow has no bearing; and clocks of the commands.
 _VENTILATOR = ("command", "inspiratory valve", "supply", "expiratory valve")
@@ -31,8 +35,13 @@ _READINGS, _MOST = 0.03, 150
 #: interval would lag, and R times that lag is pressure.
 _AT_READING = 0.0002
 
-#: Least share of a breath's samples that need a flow or volume.
-_MIN_RECORDED = 0.5
+#: Share of the noise of a flow that smoothing leaves: 0.4 to 0.65 in simulated breaths of 50 to
+#: 125 Hz.
+_LEFT = 0.65
+
+#: Least share of a breath's samples that need a flow or volume, and largest share of the volume
+#: that it takes in that gaps may leave open: about what noise is of the pressure.
+_MIN_RECORDED, _MAX_OPEN = 0.5, 0.01
 
 
 def lacks_commands(breaths: Breaths) -> bool:
@@ -48,28 +57,29 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     it is negative while gas leaves.
 
     Raises:
-        InputError: if no breath has flow or volume in at least half of its samples.
+        InputError: if no breath has flow or volume in its first sample, in at least half of all,
+            and where the flow changes.
     """
-    notes, flow = [], breaths.flow
-    if flow is not None and not np.isfinite(flow).any():
-        flow = None
-    if flow is None:
-        if breaths.volume is None:
-            raise InputError("the recording has neither flow nor volume to drive a diagnosis with")
-        flow = np.stack(
-            [np.gradient(v, t) for v, t in zip(breaths.volume, breaths.time, strict=True)]
-        )
-        notes.append("Flow is the derivative of the recorded volume.")
+    flow, notes = _recorded_flow(breaths)
     recorded = np.isfinite(flow) & breaths.valid
     good = recorded.sum(axis=1) >= _MIN_RECORDED * breaths.valid.sum(axis=1)
+    good &= recorded[:, 0]
+    for i in np.flatnonzero(good):
+        good[i] = _open(breaths.time[i, recorded[i]], flow[i, recorded[i]]) <= _MAX_OPEN
     if not good.any():
-        raise InputError("no breath has flow or volume in at least half of its samples")
+        raise InputError(
+            "no breath has flow or volume in its first sample, in at least half of all, and where "
+            "the flow changes"
+        )
     if not good.all():
-        notes.append(f"{int((~good).sum())} breaths without flow were left out.")
+        notes.append(
+            f"{int((~good).sum())} breaths without flow, or with gaps in it, were left out."
+        )
     filled = np.zeros_like(flow)
     pressure = breaths.pressure.copy()
     for i in np.flatnonzero(good):
         measured = without_noise(flow[i, recorded[i]])
+        measured[0] = flow[i, 0]  # the rise behind it must not bias what the breath begins with
         filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], measured)
         last = np.flatnonzero(recorded[i])[-1]
         pressure[i, last + 1 :] = np.nan  # what flowed there is unknown
@@ -77,6 +87,28 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     u_in = 0.5 * (filled + ahead) / _gain()
     complete = replace(breaths, flow=filled, u_in=u_in, pressure=pressure)
     return complete.select(good), notes
+
+
+def _recorded_flow(breaths: Breaths) -> tuple[Floats, list[str]]:
+    """Flow of each sample, mL/s, ``(n, T)``, if need be from the volume; and notes."""
+    if breaths.flow is not None and np.isfinite(breaths.flow).any():
+        return breaths.flow, []
+    if breaths.volume is None:
+        raise InputError("the recording has neither flow nor volume to drive a diagnosis with")
+    pairs = zip(breaths.volume, breaths.time, strict=True)
+    flow = np.stack([np.gradient(volume, time) for volume, time in pairs])
+    return flow, ["Flow is the derivative of the recorded volume."]
+
+
+def _open(time: Floats, flow: Floats) -> float:
+    """Share of the volume that a breath takes in that the gaps of its flow leave open.
+
+    Over a gap, the flow may keep either of its ends.
+    """
+    step = np.diff(time)
+    gap = np.maximum(step - 1.5 * np.median(step), 0.0)
+    inhaled = np.sum(step * np.maximum(0.5 * (flow[1:] + flow[:-1]), 0.0))
+    return float(np.sum(0.5 * gap * np.abs(np.diff(flow))) / max(inhaled, 1e-9))
 
 
 def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
@@ -132,6 +164,45 @@ def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
     return driven, index
 
 
+def begun(data: Data, driven: Breaths) -> Data:
+    """Data of breaths that begin with their flow, and with a pressure that all readings tell.
+
+    What the lung holds as a breath begins is the first reading less R times a flow with noise. A
+    fit that took that reading for sure would look for effects that make up for the noise.
+    """
+    weight = data.weight.copy()
+    weight[:, 0, 0] = 0.0
+    return replace(data, weight=weight, initial_flow=initial_flow(driven))
+
+
+def initial_flow(driven: Breaths) -> Floats:
+    """Flow into the lung at the first sample, mL/s, ``(n,)``: not zero where gas is trapped."""
+    assert driven.flow is not None
+    return driven.flow[:, 0]
+
+
+def trapped_gas_notes(driven: Breaths, R: Floats) -> list[str]:
+    """What the lungs hold above the airway as breaths end, in a sentence, where it is notable.
+
+    Args:
+        driven: breaths of :func:`drive_grid`.
+        R: fitted resistance, cmH2O/(L/s), ``(n,)``; NaN where none is.
+    """
+    assert driven.flow is not None
+    last = driven.valid.sum(axis=1, keepdims=True) - 1
+    trapped = -1e-3 * R * np.take_along_axis(driven.flow, last, axis=1)[:, 0]
+    if not np.isfinite(trapped).any():
+        return []
+    low, typical, high = np.nanquantile(trapped, [0.05, 0.5, 0.95])
+    if typical < mechanism("trapped_gas").description.least:
+        return []
+    return [
+        f"Gas still leaves the lung as breaths end: by R and the flow, {typical:.2g} cmH2O of "
+        f"trapped gas (auto-PEEP; {low:.2g} to {high:.2g} in 90 % of the breaths). The model "
+        "begins with what the flow shows of it."
+    ]
+
+
 def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: Ints) -> Floats:
     """Pressures of a simulator under the recorded flow, on the grid of a fit, cmH2O, ``(n, T)``.
 
@@ -148,11 +219,20 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
     if not isinstance(simulators, PlantSimulators):
         return np.take_along_axis(simulators.pressures(recorded), index, axis=1)
     if simulators.is_base_physics or isinstance(simulators, OnePlant | PlantsByLung):
-        return simulators.pressures(driven)
+        return open_loop_breaths(lambda part: _breathing(simulators, part), driven)
     raise InputError(
         f"the recording has no valve command, and {simulators.name} needs one; diagnose physics, "
         "a Python function or simulated pressures"
     )
+
+
+def _breathing(simulators: Simulators, driven: Breaths) -> Plant:
+    """Plants of breaths; those of the library start at the breaths' flow, others at rest."""
+    base = simulators.is_base_physics  # breaths of it are quicker by a model that starts at rest
+    plant = nominal_plants(physics, driven) if base else simulators.for_breaths(driven)
+    if isinstance(plant, Physics):
+        plant = plant.having(initial_flow=initial_flow(driven))
+    return plant
 
 
 def ventilator_side() -> tuple[str, ...]:
@@ -164,17 +244,20 @@ def _is_of_ventilator(name: str) -> bool:
     return mechanism(name).description.site in _VENTILATOR
 
 
-def lung_side_settings(settings: SelectionConfig) -> SelectionConfig:
-    """Settings whose nonparametric terms are those of the lung's side.
+def lung_side_settings(settings: SelectionConfig, breaths: Breaths) -> SelectionConfig:
+    """Settings for the lung's side of these breaths, and for the noise of their flow.
 
     What noise of the flow adds up to is slow, and no sign of physics that slow noise hides: nothing
     is searched at white noise.
     """
     chosen = settings.search.nonparametric_terms
     terms = tuple(t for t in (chosen or basis_terms()) if not _is_of_ventilator(t))
-    return replace(
-        settings, search=replace(settings.search, nonparametric_terms=terms, ventilator=())
+    flow = _recorded_flow(breaths)[0]
+    noise = float(np.median([noise_of(readings[np.isfinite(readings)]) for readings in flow]))
+    search = replace(
+        settings.search, nonparametric_terms=terms, ventilator=(), drive_noise=_LEFT * noise
     )
+    return replace(settings, search=search)
 
 
 def _volume_at(nodes: Floats, time: Floats, flow: Floats, volume: Floats) -> Floats:

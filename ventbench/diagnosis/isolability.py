@@ -189,7 +189,8 @@ def _data(breaths: Sequence[Controls], planned: int, R: float, C: float, samples
     weight[:, 1, 0] = 0.0
     ones: Floats = np.ones(n)
     position = np.minimum(np.arange(n) / max(planned - 1, 1), 1.0)  # further breaths come last
-    return Data(u_in, u_out, dt, np.zeros((n, 2, samples)), weight, R * ones, C * ones, position)
+    readings, at_rest = np.zeros((n, 2, samples)), np.zeros(n)
+    return Data(u_in, u_out, dt, readings, weight, R * ones, C * ones, position, at_rest)
 
 
 class _Responses:

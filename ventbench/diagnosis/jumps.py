@@ -24,6 +24,11 @@ from ventbench.base.arrays import Floats
 _WINDOWS, _WIDTH, _MEAN = (1, 3, 4, 6, 8, 11, 15, 20), 1.5, np.ones(11)
 
 
+def noise_of(signal: Floats) -> float:
+    """Standard deviation of the white noise of evenly spaced readings, by second differences."""
+    return 1.4826 * float(np.median(np.abs(np.diff(signal, 2)))) / np.sqrt(6.0)
+
+
 def without_noise(signal: Floats) -> Floats:
     """The signal that is expected behind evenly spaced readings with white noise.
 
@@ -35,7 +40,7 @@ def without_noise(signal: Floats) -> Floats:
     """
     if len(signal) < max(_WINDOWS):
         return signal
-    sd = 1.4826 * float(np.median(np.abs(np.diff(signal, 2)))) / np.sqrt(6.0)
+    sd = noise_of(signal)
     weighted, precision = np.zeros(len(signal)), np.zeros(len(signal))
     for direction in (1, -1):
         readings = signal[::direction]

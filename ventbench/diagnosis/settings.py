@@ -74,6 +74,9 @@ class SearchSettings:
     #: root mean square, cmH2O, of the error that a nonparametric term beside mechanisms explains,
     #: to be kept: less may be their form, or what every rig has.
     least_change: float = 0.1
+    #: noise that smoothing leaves of a flow that drives the model, mL/s; 0 where commands drive it.
+    #: Times R, it is error that a filter takes away though no rig has one: a term must take more.
+    drive_noise: float = 0.0
     #: what every ventilator has: edges of its outlet, valve, supply, and tubes. Where what a search
     #: leaves is no noise of a sensor, it is repeated from these.
     ventilator: tuple[str, ...] = (

@@ -187,6 +187,18 @@ BASE_PARAMETERS = (
         shape=True,
     ),
     Parameter(
+        "initial_flow",
+        "mL/s",
+        "flow into the lung at the first sample",
+        -3000.0,
+        3000.0,
+        0.0,
+        0.0,
+        0.0,
+        scope="breath",
+        shape=True,
+    ),
+    Parameter(
         "position",
         "1",
         "of the breath in its recording, 0 first, 1 last",

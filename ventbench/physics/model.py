@@ -258,9 +258,10 @@ def _commanded(
 
 
 def _at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousState:
-    """State of a lung at rest at a recorded pressure, cmH2O, with the valve's resting flow, L/s.
+    """State of a lung at a recorded pressure, cmH2O, with the valve's resting flow, L/s.
 
-    Newton's method finds the volume at which the recoil balances the pressure.
+    The lung is at rest, or gas flows into it at ``initial_flow``. Newton's method finds the volume
+    at which the recoil, and the pressure along the way, balance the recorded one.
     """
     pressure = recorded
     for name, mechanism in reversed(assembly.mechanisms.items()):
@@ -273,7 +274,8 @@ def _at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousStat
         for name, mechanism in assembly.mechanisms.items()
         if mechanism.stateful
     }
-    now = ContinuousState(zero, zero, pressure + zero, pressure + zero, internal)
+    initial_flow = 1e-3 * assembly.base["initial_flow"] + zero
+    now = ContinuousState(zero, initial_flow, pressure + zero, pressure + zero, internal)
     goal = pressure + assembly.base["offset"]
     volume = goal * 1e-3 * assembly.base["C"] + zero
 
@@ -282,7 +284,9 @@ def _at_rest(assembly: Assembly, recorded: Array, flow: Array) -> ContinuousStat
         # A long step, in which stresses relax; before the breath, so that no muscle pulls.
         view = _view(assembly, at_volume, at_volume, zero, zero - 1e3, zero + 1e6, pressure)
         network = _network(assembly, at_volume, flow, view, lambda name: internal.get(name, zero))
-        return volume - (network.recoil - goal) / network.elastance, None
+        along = network.resistance + network.quadratic * jnp.abs(initial_flow)
+        excess = network.recoil + along * initial_flow - goal
+        return volume - excess / network.elastance, None
 
     # A loop, as unrolled it would be most of what is to be compiled.
     volume, _ = jax.lax.scan(closer, volume, None, length=6)

@@ -31,10 +31,13 @@ class Data:
     dt: Floats  #: time to the next sample, s, ``(n, T)``.
     #: pressure, cmH2O, and flow, mL/s; zero where nothing was measured, ``(n, c, T)``.
     measured: Floats
-    weight: Floats  #: 1 where measured, else 0, ``(n, c, T)``.
+    #: 1 where measured, else 0, ``(n, c, T)``; also 0 of a first reading that only begins a breath.
+    weight: Floats
     R: Floats  #: label of the lung's resistance, cmH2O/(L/s), ``(n,)``.
     C: Floats  #: label of the lung's compliance, mL/cmH2O, ``(n,)``.
     position: Floats  #: place of each breath in its recording, 0 first, 1 last, ``(n,)``.
+    #: flow into the lung at each breath's first sample, mL/s, ``(n,)``; 0 where it is at rest.
+    initial_flow: Floats
 
     def __len__(self) -> int:
         """Number of breaths n."""
@@ -70,13 +73,15 @@ class Data:
         if not np.all(np.isfinite(pressure[weight[:, 0] > 0])):
             raise InputError("a simulated pressure is not finite; use a stable simulator")
         measured = np.where(weight > 0, pressure[:, None], 0.0)
+        measured[:, 0, 0] = np.nan_to_num(pressure[:, 0])
         return replace(self, measured=measured, weight=weight)
 
 
 def make_data(breaths: Breaths, *, flow: bool = False) -> Data:
     """Make the data of a fit from a recording, with its flow if that is asked for.
 
-    Positions, the place of each breath in its recording, are evenly from 0 to 1.
+    Positions, the place of each breath in its recording, are evenly from 0 to 1. Breaths start at
+    rest.
 
     Raises:
         InputError: if there is no breath, no pressure or, when asked for, no flow.
@@ -96,7 +101,8 @@ def make_data(breaths: Breaths, *, flow: bool = False) -> Data:
     names = ("u_in", "u_out", "dt", "R", "C")
     plain = {name: getattr(breaths, name).astype(float) for name in names}
     masked = np.where(weight > 0, measured, 0.0)
-    return Data(measured=masked, weight=weight, position=position, **plain)
+    at_rest: Floats = np.zeros(len(breaths))
+    return Data(measured=masked, weight=weight, position=position, initial_flow=at_rest, **plain)
 
 
 @dataclass(frozen=True)

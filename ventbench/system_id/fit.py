@@ -21,6 +21,7 @@ from ventbench.system_id.data import Data, Noise, robust_noise
 from ventbench.system_id.levenberg_marquardt import Minimum, minimise
 from ventbench.system_id.predictor import START, Predictor
 from ventbench.system_id.problem import (
+    GIVEN,
     Partition,
     Problem,
     free_paths,
@@ -122,7 +123,7 @@ class Fit:
 
     def plant(self, breath: int | slice = slice(None)) -> Physics:
         """The fitted model as a plant in float64: of one breath, or stacked over breaths."""
-        names = [name for name in paths(self.names) if name != "position"]
+        names = [name for name in paths(self.names) if name not in GIVEN]
         names += ["position"] if any(mechanism(m).uses_position for m in self.names) else []
         return self.problem.predictor.plant({name: self.column(name)[breath] for name in names})
 

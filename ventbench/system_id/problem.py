@@ -22,6 +22,9 @@ _START = Parameter(
     START, "cmH2O", "reading at the first sample", -50.0, 150.0, 5.0, 5.0, 5.0, scope="breath"
 )
 
+#: Parameters of a breath that its data give.
+GIVEN = ("position", "initial_flow")
+
 #: Where a change lies between two breaths, as a share: not where another one may be.
 BETWEEN = 0.49
 
@@ -402,16 +405,15 @@ def parameter_values(
 ) -> Floats:
     """Physical values of all columns of a predictor, ``(n, P + 1)``.
 
-    R, C, positions and starting pressures are those of the data, unless they are given by path as
-    others are, a number or one for each breath; the rest is neutral.
+    R, C, those of :data:`GIVEN` and starting pressures are those of the data, unless they are given
+    by path as others are, a number or one for each breath; the rest is neutral.
 
     Raises:
         InputError: if a name is unknown or a value outside its bounds.
     """
-    first = np.where(data.weight[:, 0, 0] > 0, data.measured[:, 0, 0], _DEFAULT_START)
-    remaining = {"R": data.R, "C": data.C, "position": data.position, START: first} | dict(
-        overrides
-    )
+    first = np.where(data.measured[:, 0, 0] != 0.0, data.measured[:, 0, 0], _DEFAULT_START)
+    remaining = {name: getattr(data, name) for name in ("R", "C", *GIVEN)} | {START: first}
+    remaining |= overrides
     columns = []
     for name in (*names, START):
         value = np.asarray(remaining.pop(name, None if name == START else parameter(name).neutral))

@@ -59,7 +59,6 @@ MIXED = [
 ]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("names", MIXED, ids=",".join)
 def test_half_the_step_changes_nothing(names):
     rng = np.random.default_rng(3)

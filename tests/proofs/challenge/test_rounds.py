@@ -77,7 +77,6 @@ def test_a_challenge_is_not_overwritten(made):
         make("other", made[0], "null", 1)
 
 
-@pytest.mark.slow
 def test_two_processes_make_and_answer_the_same(made, tmp_path):
     folder = ChallengeFolder(tmp_path / "c")
     assert make(SECRET, folder.path, "masked", 2, workers=2, record=coarsely) == made[1]

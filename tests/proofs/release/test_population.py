@@ -40,7 +40,6 @@ def test_scatter_is_that_within_sessions():
     assert lag == pytest.approx(-0.2, abs=0.06)
 
 
-@pytest.mark.slow
 def test_rigs_of_known_size_are_told_apart_through_the_gains_of_their_breaths():
     official, rng = frozen.load(), np.random.default_rng(1)
     scored = jax.tree.map(lambda leaf: np.asarray(leaf)[0], official.members)

@@ -69,7 +69,6 @@ def test_each_variant_differs_in_one_thing():
             assert name.endswith(f" {getattr(one, changed[0])}")
 
 
-@pytest.mark.slow
 def test_controllers_are_compared(tmp_path):
     told = []
 
@@ -104,7 +103,6 @@ def test_controllers_are_compared(tmp_path):
         compare(simulators=Textbook(2.0))
 
 
-@pytest.mark.slow
 def test_a_training_in_another_process_is_that_in_this_one(tmp_path):
     def compare(folder: str, workers: int) -> pd.DataFrame:
         lungs: Any = Textbook()
@@ -146,7 +144,6 @@ def test_the_table_of_controllers_pairs_seeds():
     assert stored["variants"][0].keys() == known["variants"][0].keys()
 
 
-@pytest.mark.slow
 def test_networks_of_another_process_are_those_of_this_one(tmp_path):
     folder = tmp_path / "recordings"
     folder.mkdir()
@@ -167,7 +164,6 @@ def test_networks_of_another_process_are_those_of_this_one(tmp_path):
     pd.testing.assert_frame_equal(compare("there", 1), compare("here", 0))
 
 
-@pytest.mark.slow
 def test_networks_are_compared(tmp_path):
     folder, out = tmp_path / "recordings", tmp_path / "out"
     folder.mkdir()

@@ -71,7 +71,6 @@ def test_missing_pressures_are_masked():
     assert error(network, recordings(30, seed=1)) < 0.7
 
 
-@pytest.mark.slow
 def test_is_reproducible_and_seeds_differ():
     breaths, config = recordings(10), Training(steps=20, batch=8)
     one, again, other = (jax.tree.leaves(trained(breaths, config, seed)) for seed in (3, 3, 4))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from ventbench.entries.reference import PID_GAINS
 from ventbench.plants.rigs import load_rigs
@@ -12,7 +11,6 @@ from ventbench.train import pid_search
 from ventbench.train.pid_search import errors_on_draws
 
 
-@pytest.mark.slow
 def test_no_neighbour_of_the_published_gains_and_no_pid_of_the_paper_is_better():
     rigs = load_rigs().of_training
     drawn = rigs.draws(COUNT)

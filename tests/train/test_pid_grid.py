@@ -152,7 +152,6 @@ def test_the_last_batch_may_be_short(monkeypatch):
 PIDS = np.array([(2.0, 4.0, 0.0), (5.0, 5.0, 0.0), (0.0, 0.1, 0.0)])
 
 
-@pytest.mark.slow
 def test_gains_are_tuned_on_draws_of_their_own():
     told = []
     grid, result = pid_search.tune_pid(gains=PIDS, draws=2, progress=lambda *x: told.append(x))
@@ -165,7 +164,6 @@ def test_gains_are_tuned_on_draws_of_their_own():
     assert pid_search.TUNING_SEED != draws.DEVELOPMENT_SEED
 
 
-@pytest.mark.slow
 def test_an_error_on_draws_is_that_of_the_scorer():
     rigs = load_rigs("single_compartment")
     drawn = draws.build(tuple((0,) for _ in rigs.lungs), 1, seed=pid_search.TUNING_SEED, n=1)

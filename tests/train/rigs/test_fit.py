@@ -80,7 +80,6 @@ def mean_errors(pooled, breaths, sessions):
     return simulation.open_loop_errors(of, breaths)
 
 
-@pytest.mark.slow
 def test_finds_known_lungs_again(fitted, around, make_synthetic, known_sessions):
     """On breaths it has not seen."""
     new = make_synthetic(THREE, each=8, seed=2)
@@ -91,7 +90,6 @@ def test_finds_known_lungs_again(fitted, around, make_synthetic, known_sessions)
     assert after.mean() < 0.1 * before.mean()
 
 
-@pytest.mark.slow
 def test_finds_the_expiratory_valve(true_parameters, around, measured, known_sessions):
     """The second stage changes what its list names, and expirations come nearer."""
     with float64():
@@ -112,7 +110,6 @@ def test_finds_the_expiratory_valve(true_parameters, around, measured, known_ses
             assert equal(getattr(refitted, name), getattr(start, name)), name
 
 
-@pytest.mark.slow
 def test_what_has_no_weight_has_no_influence_at_all(
     fitted, measured, reconstructed, known_sessions, around
 ):
@@ -127,7 +124,6 @@ def test_what_has_no_weight_has_no_influence_at_all(
     assert not equal(fitted_to(other, reconstructed, known_sessions, around), fitted)
 
 
-@pytest.mark.slow
 def test_sessions_without_breaths_stay_at_what_the_lungs_share(fitted, known_sessions):
     seen = {known_sessions.table.index(s) for s in known_sessions.table if lung(s.lung) in THREE}
     gain = np.asarray(fitted.session_gain)

@@ -196,7 +196,6 @@ def judged(*parts: Breaths) -> list[LabelTest]:
     return label_tests(rigs, [], errors, table, labels, (counts, counts), 0.4)
 
 
-@pytest.mark.slow
 def test_recorded_lungs_pass_if_they_are_what_they_say_and_not_otherwise():
     cases: tuple[tuple[dict[str, Any], bool], ...] = (
         ({"C": 50.0}, True),
@@ -216,7 +215,6 @@ def test_recorded_lungs_pass_if_they_are_what_they_say_and_not_otherwise():
         assert 0.97 * low <= rig["C"] <= 1.03 * high
 
 
-@pytest.mark.slow
 def test_recorded_lungs_with_a_common_bias_do_not_vouch_for_each_other():
     biased = judged(
         recorded("R20C50", C=37.5, gain=0.75), recorded("R20C20", C=15.0, gain=0.75, first_id=100)

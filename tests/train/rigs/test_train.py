@@ -113,7 +113,6 @@ def trained(tmp_path_factory, folder):
     return out, train_rigs(folder, out, config=config, progress=lambda *x: told.append(x)), told
 
 
-@pytest.mark.slow
 def test_the_lung_is_what_it_was(trained):
     _, simulators, _ = trained
     assert simulators.lung_ids == (OWN.id,)
@@ -127,7 +126,6 @@ def test_the_lung_is_what_it_was(trained):
     assert about["own_rig_median_mae"] < 0.8
 
 
-@pytest.mark.slow
 def test_the_resistance_is_what_it_was(trained):
     """Its prior is that of a linear resistor: a dozen breaths tell little of the laminar share."""
     _, simulators, _ = trained
@@ -140,7 +138,6 @@ def test_a_laminar_share_is_a_share():
         RigConfig(laminar_share=1.2)
 
 
-@pytest.mark.slow
 def test_the_folder_is_a_plant_for_everything(trained, folder):
     out, simulators, _ = trained
     plants = load_simulators(str(out))
@@ -156,7 +153,6 @@ def test_the_folder_is_a_plant_for_everything(trained, folder):
     assert frozen.load(path=out).manifest_sha256 == simulators.manifest_sha256
 
 
-@pytest.mark.slow
 def test_progress_and_nothing_left_behind(trained):
     out, _, told = trained
     shares = [share for _, share in told]
@@ -169,7 +165,6 @@ def test_progress_and_nothing_left_behind(trained):
     }
 
 
-@pytest.mark.slow
 def test_an_interrupted_training_goes_on_to_the_same_bytes(tmp_path, folder):
     def stop(what: str, share: float) -> None:
         if share > 0.5:

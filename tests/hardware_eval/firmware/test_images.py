@@ -261,7 +261,7 @@ def test_the_boards_watchdog_vents_and_resets_a_program_that_stands_still(tmp_pa
 
 
 @pytest.mark.slow
-def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(
+def test_self_test_and_two_runs_on_an_emulated_microcontroller(
     tmp_path: Path, scored_only: Path
 ) -> None:
     image = _made("mps2", tmp_path)
@@ -301,9 +301,9 @@ def test_self_test_and_a_run_of_twelve_on_an_emulated_microcontroller(
                 "--lung",
                 LUNG,
                 "--pips",
-                "10,15,20",
+                "10,20",
                 "--repeats",
-                "4",
+                "1",
                 "--plan",
                 str(scored_only),
                 "--in-process",

@@ -132,7 +132,6 @@ def test_a_little_of_what_every_rig_has_is_compared_with_but_not_named():
     assert found.names == tuple(found.held_out_gains) == ("turbulent_resistance",)
 
 
-@pytest.mark.slow  # every refit has each breath's own effort
 def test_strong_efforts_are_selected_and_nothing_else():
     effect = small.effect("patient_effort", amplitude=5.0, duration=0.8)
     named = small.concluded(small.made(effect, seed=4)).named

@@ -149,7 +149,6 @@ def test_trapped_gas_is_no_leak():
     assert found.column("trapped_gas.pressure")[0] == pytest.approx(2.5, rel=0.1)
 
 
-@pytest.mark.slow
 def test_the_verdict_says_what_changes_by_how_much_from_which_breath_on():
     """Pattern 5: breaths that are affected are told."""
     found = diagnose(stepped("gain_step"), settings=small.SETTINGS)

@@ -16,6 +16,8 @@ from ventbench.recordings import join
 
 from . import small
 
+INSPIRED = 30
+
 
 def test_nothing_is_missing():
     found = small.concluded(small.made(seed=1))
@@ -63,43 +65,6 @@ def test_a_mechanism_is_enough():
     assert found.base.hypothesis.names == ()
 
 
-@pytest.mark.slow
-def test_resistance_that_depends_on_volume_is_an_unnamed_effect():
-    found = small.concluded(small.made(small.effect("volume_resistance", "R(V)", change=0.65)))
-    assert found.names == ()
-    assert found.unnamed is not None
-    assert (found.unnamed.name, found.unnamed.term) == ("R(V)", "volume_resistance")
-    assert found.unnamed.swing is None
-    assert found.unnamed.nats > 20.0
-    assert found.full.hypothesis.names == ("volume_resistance",)
-    shown = nonparametric_term(found)
-    assert shown is not None
-    assert shown.name == "R(V)"
-    assert 0.5 < shown.explains <= 1.0
-    assert shown.x_unit.endswith("mL")
-    # The rig's resistance grows with volume; what R could absorb is taken out.
-    assert np.polyfit(shown.x, shown.y, 1)[0] * np.ptp(shown.x) > 3.0
-
-
-@pytest.mark.slow  # many refits
-def test_a_beating_heart_is_at_the_alveolus():
-    beats = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=1.4)
-    found = small.concluded(small.made(beats))
-    assert found.names == ()
-    assert found.unnamed is not None
-    assert (found.unnamed.name, found.unnamed.term) == (ALVEOLUS, None)
-    assert found.unnamed.swing is not None
-    assert found.unnamed.swing.frequency == pytest.approx(1.4, abs=0.2)
-    assert 0.0 < found.unnamed.swing.frequency_sd < 0.2
-    assert found.unnamed.nats > 20.0
-    assert found.full is found.named
-    shown = nonparametric_term(found)
-    assert shown is not None
-    assert "1.4 times a second" in shown.meaning
-    assert shown.explains > 0.5
-    assert np.ptp(shown.y) == pytest.approx(2.6, rel=0.4)
-
-
 def test_a_mechanism_stands_beside_an_unnamed_effect():
     beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     name = small.effect("turbulent_resistance", quadratic=10.0)
@@ -126,33 +91,66 @@ def test_scatter_of_the_valves_gain_is_no_missing_physics():
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
 
 
-@pytest.mark.slow  # all terms take minutes to compile
-@pytest.mark.parametrize(
-    ("name", "form", "parameters", "place"),
-    [
-        ("volume_resistance", "R(V)", {"change": 0.65}, "R(V)"),
-        ("cardiogenic", "oscillation", {"amplitude": 1.3, "frequency": 1.4}, ALVEOLUS),
-        ("direction_resistance", "R(direction)", {"ratio": 2.0}, "R(direction)"),
-    ],
-)
-def test_unnamed_effects_are_found_among_all_terms(name, form, parameters, place):
-    breaths = small.made(small.effect(name, form, **parameters), samples=60)
-    found = small.concluded(breaths, small.ALL_TERMS)
+def test_resistance_that_depends_on_volume_is_an_unnamed_effect_among_all_terms():
+    found = small.concluded(
+        small.made(small.effect("volume_resistance", "R(V)", change=0.65)), small.ALL_TERMS
+    )
     assert found.names == ()
     assert found.unnamed is not None
-    assert found.unnamed.name == place
+    assert (found.unnamed.name, found.unnamed.term) == ("R(V)", "volume_resistance")
+    assert found.unnamed.swing is None
+    assert found.unnamed.nats > 20.0
+    assert found.full.hypothesis.names == ("volume_resistance",)
+    shown = nonparametric_term(found)
+    assert shown is not None
+    assert shown.name == "R(V)"
+    assert 0.5 < shown.explains <= 1.0
+    assert shown.x_unit.endswith("mL")
+    # The rig's resistance grows with volume; what R could absorb is taken out.
+    assert np.polyfit(shown.x, shown.y, 1)[0] * np.ptp(shown.x) > 3.0
 
 
-@pytest.mark.slow  # all terms take minutes to compile
-def test_a_mechanism_or_nothing_is_enough_among_all_terms():
-    named = small.concluded(
-        small.made(small.effect("viscoelasticity", ratio=0.7, time=1.0)), small.ALL_TERMS
-    )
-    assert named.names == ("viscoelasticity",)
-    assert named.unnamed is None
-    nothing = small.concluded(small.made(seed=1), small.ALL_TERMS)
-    assert nothing.names == ()
-    assert nothing.unnamed is None
+def test_a_beating_heart_is_at_the_alveolus():
+    beats = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=1.4)
+    found = small.concluded(small.made(beats))
+    assert found.names == ()
+    assert found.unnamed is not None
+    assert (found.unnamed.name, found.unnamed.term) == (ALVEOLUS, None)
+    swing = found.unnamed.swing
+    assert swing is not None
+    assert swing.frequency == pytest.approx(1.4, abs=0.2)
+    assert 0.0 < swing.frequency_sd < 0.2
+    size = float(np.sqrt(np.mean(swing.course[:, :INSPIRED] ** 2)))
+    assert size == pytest.approx(1.3 / np.sqrt(2), rel=0.3)
+    assert swing.noise.sigma[0] == pytest.approx(0.2, rel=0.4)
+    assert found.unnamed.nats > 20.0
+    assert found.full is found.named
+    shown = nonparametric_term(found)
+    assert shown is not None
+    assert "1.4 times a second" in shown.meaning
+    assert shown.explains > 0.5
+    assert np.ptp(shown.y) == pytest.approx(2.6, rel=0.4)
+
+
+def test_resistance_that_depends_on_direction_is_found_among_all_terms():
+    effect = small.effect("direction_resistance", "R(direction)", ratio=2.0)
+    found = small.concluded(small.made(effect, samples=60), small.ALL_TERMS)
+    assert found.names == ()
+    assert found.unnamed is not None
+    assert found.unnamed.name == "R(direction)"
+
+
+def test_a_mechanism_is_enough_among_all_terms():
+    effect = small.effect("viscoelasticity", ratio=0.7, time=1.0)
+    found = small.concluded(small.made(effect), small.ALL_TERMS)
+    assert found.names == ("viscoelasticity",)
+    assert found.unnamed is None
+
+
+def test_nothing_is_missing_among_all_terms():
+    found = small.concluded(small.made(seed=1), small.ALL_TERMS)
+    assert found.names == ()
+    assert found.unnamed is None
 
 
 def test_what_no_sensor_leaves_is_searched_again_from_all_of_a_ventilator(monkeypatch):

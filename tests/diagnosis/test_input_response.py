@@ -42,7 +42,6 @@ def test_an_input_at_the_alveolus_acts_as_muscles_do(clean):
     np.testing.assert_allclose(drawn, seen, atol=0.06)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("sample", [5, 17, 29])
 def test_an_input_at_the_supply_acts_as_more_command(clean, sample):
     partition, values, before = clean
@@ -56,26 +55,17 @@ def test_an_input_at_the_supply_acts_as_more_command(clean, sample):
     np.testing.assert_allclose(found, slope, atol=0.1 * np.abs(slope).max())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "amplitude", "frequency", "place"),
-    [
-        ("cardiogenic", 1.3, 1.1, ALVEOLUS),
-        ("cardiogenic", 1.3, 1.5, ALVEOLUS),
-        ("pulsating_supply", 0.175, 5.0, SUPPLY),
-    ],
-)
-def test_an_oscillation_is_found_at_its_place_and_rate(name, amplitude, frequency, place):
-    acting = small.effect(name, "oscillation", amplitude=amplitude, frequency=frequency)
+def test_an_oscillation_of_the_supply_is_found_at_its_place_and_rate():
+    acting = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     found = small.concluded(small.made(acting))
     assert found.names == ()
     assert found.unnamed is not None
     assert found.unnamed.swing is not None
-    assert found.unnamed.name == place
+    assert found.unnamed.name == SUPPLY
     swing = found.unnamed.swing
-    assert swing.frequency == pytest.approx(frequency, abs=0.2)
+    assert swing.frequency == pytest.approx(5.0, abs=0.2)
     assert swing.course.shape == (8, small.SAMPLES)
     size = float(np.sqrt(np.mean(swing.course[:, :INSPIRED] ** 2)))
-    assert size == pytest.approx(amplitude / np.sqrt(2), rel=0.3)
+    assert size == pytest.approx(0.175 / np.sqrt(2), rel=0.3)
     assert swing.noise.sigma[0] == pytest.approx(0.2, rel=0.4)
     assert found.unnamed.nats > 20.0

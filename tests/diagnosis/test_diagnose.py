@@ -154,7 +154,6 @@ def test_held_out_readings_change_no_answer(found, other):
     assert other.open_loop.after != found.open_loop.after
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("which", ["found", "own", "strange"])
 def test_the_corrected_plant_in_its_file_gives_the_same_answers(which, request, tmp_path):
     diagnosis: Diagnosis = request.getfixturevalue(which)
@@ -183,7 +182,6 @@ def test_the_corrected_plant_answers_as_the_report_says(which, request, breaths)
     np.testing.assert_allclose(answer, diagnosis.traces.after, atol=1e-3)
 
 
-@pytest.mark.slow  # two more conclusions
 def test_another_strength_than_the_simulators_is_missing(breaths):
     much = diagnose(breaths, simulator=turbulent(20.0), settings=small.SETTINGS)
     assert much.verdict == "named"

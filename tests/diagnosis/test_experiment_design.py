@@ -87,7 +87,6 @@ def expected(truth, other, u_in, u_out):
     return contrast(one, two, NOISE).nats(np.arange(n))
 
 
-@pytest.mark.slow
 def test_pulses_tell_a_lag_from_a_delay():
     # Smooth commands: of those that ring at the sampling rate, a delay explains nothing, and any
     # breath refutes it.
@@ -152,7 +151,6 @@ def test_commands_of_all_kinds_are_possible():
         assert pressure.max() <= 35.0 + 1e-9
 
 
-@pytest.mark.slow
 def test_nats_against_new_recordings():
     """Recorded, refitted and compared for real: the log-likelihood ratio grows as foretold."""
     gains, foretold = [], []

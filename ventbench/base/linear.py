@@ -45,7 +45,10 @@ def solve_lower(L: Floats, right: Floats) -> Floats:
     LAPACK directly: of matrices as small as those of a search, the checks of
     :func:`scipy.linalg.solve_triangular` take five times as long as the solution.
     """
-    return np.asarray(lapack.dtrtrs(L, right, lower=1)[0] if len(L) else right, np.float64)
+    if not len(L):
+        return right
+    x, _ = lapack.dtrtrs(L, right, lower=1)  # type: ignore[attr-defined]
+    return np.asarray(x, np.float64)
 
 
 def cholesky(matrix: Floats) -> NDArray[np.float64]:

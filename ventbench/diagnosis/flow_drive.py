@@ -191,15 +191,13 @@ def trapped_gas_notes(driven: Breaths, R: Floats) -> list[str]:
     assert driven.flow is not None
     last = driven.valid.sum(axis=1, keepdims=True) - 1
     trapped = -1e-3 * R * np.take_along_axis(driven.flow, last, axis=1)[:, 0]
-    if not np.isfinite(trapped).any():
-        return []
-    low, typical, high = np.nanquantile(trapped, [0.05, 0.5, 0.95])
+    trapped = trapped[np.isfinite(trapped)]
+    typical = float(np.median(trapped)) if len(trapped) else 0.0
     if typical < mechanism("trapped_gas").description.least:
         return []
     return [
         f"Gas still leaves the lung as breaths end: by R and the flow, {typical:.2g} cmH2O of "
-        f"trapped gas (auto-PEEP; {low:.2g} to {high:.2g} in 90 % of the breaths). The model "
-        "begins with what the flow shows of it."
+        "trapped gas (auto-PEEP; median). The model begins with what the flow shows of it."
     ]
 
 
@@ -253,7 +251,7 @@ def lung_side_settings(settings: SelectionConfig, breaths: Breaths) -> Selection
     chosen = settings.search.nonparametric_terms
     terms = tuple(t for t in (chosen or basis_terms()) if not _is_of_ventilator(t))
     flow = _recorded_flow(breaths)[0]
-    noise = float(np.median([noise_of(readings[np.isfinite(readings)]) for readings in flow]))
+    noise = float(np.median([noise_of(x[np.isfinite(x)]) for x in flow]))
     search = replace(
         settings.search, nonparametric_terms=terms, ventilator=(), drive_noise=_LEFT * noise
     )

@@ -25,8 +25,12 @@ _WINDOWS, _WIDTH, _MEAN = (1, 3, 4, 6, 8, 11, 15, 20), 1.5, np.ones(11)
 
 
 def noise_of(signal: Floats) -> float:
-    """Standard deviation of the white noise of evenly spaced readings, by second differences."""
-    return 1.4826 * float(np.median(np.abs(np.diff(signal, 2)))) / np.sqrt(6.0)
+    """Standard deviation of the white noise of evenly spaced readings, by second differences.
+
+    Zero of two readings and fewer.
+    """
+    bends = np.abs(np.diff(signal, 2)) if len(signal) > 2 else np.zeros(1)
+    return 1.4826 * float(np.median(bends)) / np.sqrt(6.0)
 
 
 def without_noise(signal: Floats) -> Floats:

@@ -412,7 +412,8 @@ def parameter_values(
         InputError: if a name is unknown or a value outside its bounds.
     """
     first = np.where(data.measured[:, 0, 0] != 0.0, data.measured[:, 0, 0], _DEFAULT_START)
-    remaining = {name: getattr(data, name) for name in ("R", "C", *GIVEN)} | {START: first}
+    remaining = {name: getattr(data, name) for name in ("R", "C", *GIVEN) if name in names}
+    remaining[START] = first
     remaining |= overrides
     columns = []
     for name in (*names, START):

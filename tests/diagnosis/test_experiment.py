@@ -140,7 +140,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "gains": {"valve": gains},
     "some breaths low": {"valve": nothing, "low": 0.2},
     "step": {"valve": nothing, "step": 0.2},
-    "rows missing": {"valve": nothing, "rows": 0.1},
+    "rows_missing": {"valve": nothing, "rows": 0.1},
 }
 
 

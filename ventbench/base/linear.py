@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from ventbench.base.arrays import Floats
 
@@ -37,18 +36,6 @@ def inverse(matrix: Floats) -> Floats:
         finite = np.isfinite(matrix).all(axis=(-2, -1), keepdims=True)
         pseudoinverse = np.linalg.pinv(np.where(finite, matrix, 0.0))
         return np.where(finite, pseudoinverse, np.nan)
-
-
-def solve_lower(L: Floats, right: Floats) -> Floats:
-    """Solution ``x`` of ``L @ x = right`` for a lower triangular factor ``(k, k)``, ``(k, m)``.
-
-    LAPACK directly: of matrices as small as those of a search, the checks of
-    :func:`scipy.linalg.solve_triangular` take five times as long as the solution.
-    """
-    if not len(L):
-        return right
-    x, _ = lapack.dtrtrs(L, right, lower=1)  # type: ignore[attr-defined]
-    return np.asarray(x, np.float64)
 
 
 def cholesky(matrix: Floats) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.base.linear import cholesky, solve_lower
+from ventbench.base.linear import cholesky
 from ventbench.diagnosis.evaluator import Evaluator
 from ventbench.diagnosis.hypothesis import FittedModel, Hypothesis, Partition
 from ventbench.diagnosis.in_time import SWINGS, in_time, of_some_breaths, swings, with_course
@@ -34,6 +34,7 @@ from ventbench.diagnosis.linearised import (
     latent_of,
     names_of,
     simulate,
+    solve_lower,
     within,
 )
 from ventbench.physics.catalogue import basis_terms, library, mechanism

@@ -289,9 +289,7 @@ class _Signal:
 
         Several must have both neighbours on one side: an edge may pass zero.
         """
-        where = np.flatnonzero(np.isfinite(self.values))
-        values = self.values[where]
-        out = np.zeros(len(self.values), bool)
+        values, out = self.values, np.zeros(len(self.values), bool)
         spans = [span for span in runs(values == 0.0) if span[0] > 0 and span[1] < len(values)]
         if not spans:
             return out
@@ -301,7 +299,7 @@ class _Signal:
         far &= last - first <= 2
         if np.sum(far & (before * after > 0.0)) >= _AGAIN:
             for start, stop in zip(first[far], last[far], strict=True):
-                out[where[start:stop]] = True
+                out[start:stop] = True
         return out
 
     @property

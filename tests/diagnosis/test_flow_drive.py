@@ -12,8 +12,11 @@ from ventbench.diagnosis import flow_drive
 from ventbench.diagnosis.diagnose import diagnose
 from ventbench.diagnosis.jumps import without_noise
 from ventbench.diagnosis.settings import DEFAULT
+from ventbench.physics import paths
 from ventbench.plants.catalog import load_simulators
 from ventbench.recordings.breaths import Breaths, make_breaths
+from ventbench.system_id import make_data
+from ventbench.system_id.problem import parameter_values
 
 R, C = 18.0, 42.0
 
@@ -160,6 +163,15 @@ def test_trapped_gas_drives_the_simulator_too():
     answers = flow_drive.simulate(load_simulators("physics"), whole, driven, index)
     readings = np.isfinite(driven.pressure)  # by linearity those of the breath without it
     assert np.abs(answers - driven.pressure)[readings].mean() < 0.05
+
+
+@pytest.mark.parametrize("by_flow", [False, True])
+def test_a_breath_may_begin_at_a_pressure_of_zero(by_flow):
+    breaths = recorded(4)
+    pressure = breaths.pressure - breaths.pressure[:, :1]
+    data = make_data(dataclasses.replace(breaths, pressure=pressure))
+    data = flow_drive.begun(data, breaths) if by_flow else data
+    np.testing.assert_allclose(parameter_values(data, paths(), {})[:, -1], 0.0, atol=1e-6)
 
 
 def test_gas_that_leaves_as_breaths_end_is_said():

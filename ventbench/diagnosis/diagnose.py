@@ -346,7 +346,7 @@ def _conclude(
     lungs, notes_on_lungs = _lungs(experiment.recorded.select(identifying), alone.fit)
     if experiment.by_flow:
         fitted_R = {match.label: match.fitted_R for match in lungs}
-        R = np.array([fitted_R.get(label, np.nan) for label in breaths.lung_ids.tolist()])
+        R = np.array([fitted_R.get(label, np.nan) for label in breaths.lung_ids])
         notes_on_lungs += flow_drive.trapped_gas_notes(breaths, R)
     noise, pressures = conclusion.noise, correction.pressures
     if experiment.by_flow and breaths.flow is not None:

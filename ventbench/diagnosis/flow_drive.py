@@ -35,9 +35,8 @@ _READINGS, _MOST = 0.03, 150
 #: interval would lag, and R times that lag is pressure.
 _AT_READING = 0.0002
 
-#: Share of the noise of a flow that smoothing leaves: 0.4 to 0.65 in simulated breaths of 50 to
-#: 125 Hz.
-_LEFT = 0.65
+#: Share of the noise of a flow that smoothing leaves at most, by the tests of it.
+_LEFT = 0.7
 
 #: Least share of a breath's samples that need a flow or volume, and largest share of the volume
 #: that it takes in that gaps may leave open: about what noise is of the pressure.
@@ -69,7 +68,7 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     if not good.any():
         raise InputError(
             "no breath has flow or volume in its first sample, in at least half of all, and where "
-            "the flow changes"
+            "the flow changes; begin each breath with a row that has a flow"
         )
     if not good.all():
         notes.append(
@@ -170,9 +169,10 @@ def begun(data: Data, driven: Breaths) -> Data:
     What the lung holds as a breath begins is the first reading less R times a flow with noise. A
     fit that took that reading for sure would look for effects that make up for the noise.
     """
-    weight = data.weight.copy()
+    weight, measured = data.weight.copy(), data.measured.copy()
     weight[:, 0, 0] = 0.0
-    return replace(data, weight=weight, initial_flow=initial_flow(driven))
+    measured[measured[:, 0, 0] == 0.0, 0, 0] = 1e-9  # zero would be a reading that there is not
+    return replace(data, weight=weight, measured=measured, initial_flow=initial_flow(driven))
 
 
 def initial_flow(driven: Breaths) -> Floats:
@@ -190,10 +190,8 @@ def trapped_gas_notes(driven: Breaths, R: Floats) -> list[str]:
     """
     assert driven.flow is not None
     last = driven.valid.sum(axis=1, keepdims=True) - 1
-    trapped = -1e-3 * R * np.take_along_axis(driven.flow, last, axis=1)[:, 0]
-    trapped = trapped[np.isfinite(trapped)]
-    typical = float(np.median(trapped)) if len(trapped) else 0.0
-    if typical < mechanism("trapped_gas").description.least:
+    typical = float(np.median(-1e-3 * R * np.take_along_axis(driven.flow, last, axis=1)[:, 0]))
+    if not typical >= mechanism("trapped_gas").description.least:  # nor where it is unknown
         return []
     return [
         f"Gas still leaves the lung as breaths end: by R and the flow, {typical:.2g} cmH2O of "
@@ -228,9 +226,8 @@ def _breathing(simulators: Simulators, driven: Breaths) -> Plant:
     """Plants of breaths; those of the library start at the breaths' flow, others at rest."""
     base = simulators.is_base_physics  # breaths of it are quicker by a model that starts at rest
     plant = nominal_plants(physics, driven) if base else simulators.for_breaths(driven)
-    if isinstance(plant, Physics):
-        plant = plant.having(initial_flow=initial_flow(driven))
-    return plant
+    flow = initial_flow(driven)
+    return plant.having(initial_flow=flow) if isinstance(plant, Physics) else plant
 
 
 def ventilator_side() -> tuple[str, ...]:

@@ -411,7 +411,8 @@ def parameter_values(
     Raises:
         InputError: if a name is unknown or a value outside its bounds.
     """
-    first = np.where(data.measured[:, 0, 0] != 0.0, data.measured[:, 0, 0], _DEFAULT_START)
+    reading = data.measured[:, 0, 0]
+    first = np.where((data.weight[:, 0, 0] > 0.0) | (reading != 0.0), reading, _DEFAULT_START)
     remaining = {name: getattr(data, name) for name in ("R", "C", *GIVEN) if name in names}
     remaining[START] = first
     remaining |= overrides

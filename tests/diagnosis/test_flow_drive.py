@@ -165,6 +165,25 @@ def test_trapped_gas_drives_the_simulator_too():
     assert np.abs(answers - driven.pressure)[readings].mean() < 0.05
 
 
+def test_what_smoothing_takes_off_the_flow_is_known_as_pressure():
+    breaths = recorded(3)
+    noise = np.random.default_rng(1).normal(0.0, 5.0, breaths.flow.shape)
+    noisy, _ = flow_drive.with_flow(dataclasses.replace(breaths, flow=breaths.flow + noise))
+    driven, index = flow_drive.drive_grid(noisy)
+    of_noise = flow_drive.of_noise(driven, np.array([20.0, 40.0, np.nan]))
+    readings = np.isfinite(driven.pressure)
+    readings[:, 0] = False
+    size = [of_noise[i, readings[i]].std() for i in range(3)]
+    assert 0.05 < size[0] < 0.11  # the noise is 0.1 cmH2O at 20 cmH2O/(L/s)
+    assert size[1] == pytest.approx(2.0 * size[0], rel=0.2)
+    assert size[2] == 0.0
+    raw = np.take_along_axis(noisy.flow, index, axis=1)
+    smooth = raw - of_noise / np.array([[0.02], [0.04], [1.0]])
+    true = np.take_along_axis(breaths.flow, index, axis=1)
+    errors = [np.abs(x - true)[:2][readings[:2]].mean() for x in (raw, smooth)]
+    assert errors[1] < 0.8 * errors[0]
+
+
 @pytest.mark.parametrize("by_flow", [False, True])
 def test_a_breath_may_begin_at_a_pressure_of_zero(by_flow):
     breaths = recorded(4)

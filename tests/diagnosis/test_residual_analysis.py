@@ -12,6 +12,7 @@ from ventbench.diagnosis.corrected import (
     open_loop_error,
 )
 from ventbench.diagnosis.experiment import Judge
+from ventbench.diagnosis.flow_drive import most_alike
 from ventbench.diagnosis.residual_analysis import (
     axes,
     before,
@@ -240,6 +241,25 @@ def test_a_flow_that_drives_is_at_rest_after_most_gas_has_left():
     quiet = quiet_samples(driven)
     assert quiet[recorded.time > 1.7].all()
     assert not quiet[recorded.time < 1.55].any()
+
+
+def test_noise_of_a_flow_that_drives_makes_no_range_err():
+    """It moves the pressure that a sample is sorted by as much as the error of the sample."""
+    rng = np.random.default_rng(4)
+    recorded, *_ = exact(4, n=20)
+    flow = np.where(recorded.time < 1.0, 430.0, 0.0) * np.minimum(recorded.time / 0.5, 1.0)
+    noisy = flow + rng.normal(0.0, 8.0, flow.shape)
+    volume = np.cumsum(flow, axis=1)
+    like = most_alike(dataclasses.replace(recorded, flow=noisy))
+    assert (like != np.arange(20)).all()
+
+    def places(error):
+        pressure = 5.0 + 0.03 * flow + error + rng.normal(0.0, 0.1, flow.shape)
+        seen = dataclasses.replace(recorded, u_in=noisy, pressure=pressure)
+        return locate(seen, 5.0 + 0.03 * noisy, SD, noisy, volume, sorted_by=like)
+
+    assert places(0.0) == ()
+    assert {place.axis for place in places(0.3 * (flow > 330.0))} >= {"pressure", "flow"}
 
 
 def test_no_range_ends_at_a_value_that_comes_again_and_again():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ventbench.base.errors import InputError
 from ventbench.mechanics import identify
 from ventbench.recordings import check, load, make_breaths, require_roles, write
-from ventbench.recordings.bad_samples import blanked, clean, find_bad_samples
+from ventbench.recordings.bad_samples import blanked, clean, find_bad_samples, repeated_rows
 from ventbench.recordings.breaths import join
 
 RATE, PERIOD = 50.0, 3.0
@@ -126,6 +126,16 @@ def test_zeros_at_which_a_flow_turns_are_readings():
     assert find_bad_samples(columns) == ()
 
 
+@pytest.mark.parametrize("row", [299, 300, 449, 450, 520])  # beside steps of the flow, or far off
+def test_a_spike_on_an_edge_of_a_flow_is_found(row):
+    columns = signals()
+    assert find_bad_samples(columns) == ()
+    neighbours = columns["flow"][[row - 1, row + 1]]
+    columns["flow"][row] = neighbours.max() + 600.0
+    (found,) = find_bad_samples(columns)
+    assert (found.kind, found.rows.tolist()) == ("isolated", [row])
+
+
 def test_a_spike_that_others_hide_is_found():
     columns = signals()
     rows = np.array([320, 322, 324])
@@ -136,10 +146,11 @@ def test_a_spike_that_others_hide_is_found():
 
 
 def test_no_flow_at_rest_is_a_reading_and_a_dead_sensor_is_not():
-    """A flow without noise, which steps with the valve, is exactly zero in a lung at rest."""
+    """A flow without noise, which follows the valve, is exactly zero in a lung at rest."""
     rng = np.random.default_rng(0)
     phase = np.tile(np.arange(0.0, 4.0, 0.04), 4)
-    flow = np.where(phase < 1.0, rng.uniform(50.0, 500.0, phase.size), 0.0)
+    valve = np.interp(np.arange(400), np.arange(0, 400, 5), rng.uniform(50.0, 500.0, 80))
+    flow = np.where(phase < 1.0, valve, 0.0)
     flow += np.where((phase > 1.0) & (phase < 2.0), -300.0 * np.exp(-3.0 * phase), 0.0)
     volume = np.where(phase < 1.0, 0.3 * phase, 0.3 * np.exp(-8.0 * np.maximum(phase - 1.0, 0.0)))
     pressure = 5.0 + 50.0 * volume + rng.normal(0.0, 0.05, phase.size)
@@ -214,3 +225,18 @@ def test_a_notable_share_is_said_first_and_a_large_one_is_refused():
     for door in (identify, require_roles):
         with pytest.raises(InputError, match=r"22 % of the readings of flow .* is unusable"):
             door(spoiled)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_that_come_twice_are_told_from_rows_that_are_held(seed):
+    """Without a clock the signal goes on by one step behind the first, by two behind the others."""
+    columns = signals(seed)
+    at = np.sort(np.random.default_rng(seed).choice(np.arange(5, 1790), 40, replace=False))
+    at = np.union1d(at, [301, 451])  # on edges, where no line fits
+    order = np.sort(np.concatenate([np.arange(1800), at]))
+    twice = {name: values[order] for name, values in columns.items()}
+    assert repeated_rows(twice).sum() == len(at)
+    held = {name: values.copy() for name, values in columns.items()}
+    for values in held.values():
+        values[at] = values[at - 1]
+    assert not repeated_rows(held).any()

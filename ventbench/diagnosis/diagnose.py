@@ -344,32 +344,35 @@ def _conclude(
     if simulator_effect is not None and term is not None and simulator_effect.name == term.name:
         notes_on_simulator.append(f"The simulator needs a nonparametric term at {term.name} too.")
     lungs, notes_on_lungs = _lungs(experiment.recorded.select(identifying), alone.fit)
-    if experiment.by_flow:
+    noise, pressures = conclusion.noise, correction.pressures
+    tested = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1) & identifying)
+    of_drive, like = 0.0, None
+    if experiment.by_flow and breaths.flow is not None:
         fitted_R = {match.label: match.fitted_R for match in lungs}
         R = np.array([fitted_R.get(label, np.nan) for label in breaths.lung_ids])
         notes_on_lungs += flow_drive.trapped_gas_notes(breaths, R)
-    noise, pressures = conclusion.noise, correction.pressures
-    if experiment.by_flow and breaths.flow is not None:
+        of_drive = flow_drive.of_noise(breaths, R)
+        like = flow_drive.most_alike(breaths.select(tested))
         flow = breaths.flow
         volume = np.cumsum(data.u_in * data.dt, axis=1) * float(parameter("gain").neutral)
     else:
         flow, volume = flow_and_volume(breaths, recording_model.fit, pressures["refit"])
-    tested = np.flatnonzero(~np.isnan(pressures["refit"]).all(axis=1) & identifying)
     gain, start = recording_model.sensitivities(data)
     # What each breath may have of its own: a start, as its first reading is noisy, and a gain.
     scattered = conclusion.gain_sd > 0.0
     nuisance = np.stack([start, gain] if scattered else [start], axis=-1)
     judged = None  # efforts of breaths to come are unknown
     if not conclusion.full.hypothesis.breath_terms:
-        judged = judge.excess(pressures["after"], nuisance, quiet_samples(breaths))
+        judged = judge.excess(pressures["after"] + of_drive, nuisance, quiet_samples(breaths))
     adequacy = check_residuals(
         breaths.select(tested),
-        pressures["after"][tested],
+        (pressures["after"] + of_drive)[tested],
         gain[tested],
         start[tested],
         noise.sigma[0],
         flow[tested],
         volume[tested],
+        sorted_by=like,
         judged=judged,
         gains_scatter=scattered,
         settings=settings.residuals,
@@ -397,10 +400,11 @@ def _conclude(
     of_start = of_breaths(breaths, pressures["refit"], gain, start)[2]
     location = locate(
         breaths.select(tested),
-        (pressures["refit"] + of_start)[tested],
+        (pressures["refit"] + of_start + of_drive)[tested],
         noise.sigma[0],
         flow[tested],
         volume[tested],
+        sorted_by=like,
         settings=settings.residuals,
     )
     form, term = estimates.split_form(term, tuple(missing))

@@ -13,12 +13,13 @@ import numpy as np
 
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.diagnosis.jumps import noise_of, without_noise
+from ventbench.diagnosis.jumps import without_noise
 from ventbench.diagnosis.settings import SelectionConfig
 from ventbench.physics.catalogue import basis_terms, library, mechanism, parameter
 from ventbench.physics.model import Physics, physics
 from ventbench.plants.simulators import OnePlant, PlantsByLung, PlantSimulators, Simulators
 from ventbench.plants.stacking import nominal_plants, open_loop_breaths
+from ventbench.recordings.bad_samples import noise_of
 from ventbench.recordings.breaths import FILL, Breaths, stack, stack_times, valid_mask
 from ventbench.system_id.data import Data
 from ventbench.task.interfaces import Plant
@@ -52,8 +53,8 @@ def lacks_commands(breaths: Breaths) -> bool:
 def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     """Breaths whose ``flow`` has no gaps and whose ``u_in`` stands for the flow; and notes.
 
-    ``u_in`` is the command at which the base model's valve has the mean flow until the next sample;
-    it is negative while gas leaves.
+    ``u_in`` is the command at which the base model's valve has the mean flow until the next sample,
+    less its noise; it is negative while gas leaves.
 
     Raises:
         InputError: if no breath has flow or volume in its first sample, in at least half of all,
@@ -74,16 +75,15 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
         notes.append(
             f"{int((~good).sum())} breaths without flow, or with gaps in it, were left out."
         )
-    filled = np.zeros_like(flow)
+    filled, smooth = np.zeros_like(flow), np.zeros_like(flow)
     pressure = breaths.pressure.copy()
     for i in np.flatnonzero(good):
-        measured = without_noise(flow[i, recorded[i]])
-        measured[0] = flow[i, 0]  # the rise behind it must not bias what the breath begins with
-        filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], measured)
+        filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], flow[i, recorded[i]])
+        smooth[i] = _smooth(filled[i])
         last = np.flatnonzero(recorded[i])[-1]
         pressure[i, last + 1 :] = np.nan  # what flowed there is unknown
-    ahead = np.concatenate([filled[:, 1:], filled[:, -1:]], axis=1)
-    u_in = 0.5 * (filled + ahead) / _gain()
+    ahead = np.concatenate([smooth[:, 1:], smooth[:, -1:]], axis=1)
+    u_in = 0.5 * (smooth + ahead) / _gain()
     complete = replace(breaths, flow=filled, u_in=u_in, pressure=pressure)
     return complete.select(good), notes
 
@@ -97,6 +97,13 @@ def _recorded_flow(breaths: Breaths) -> tuple[Floats, list[str]]:
     pairs = zip(breaths.volume, breaths.time, strict=True)
     flow = np.stack([np.gradient(volume, time) for volume, time in pairs])
     return flow, ["Flow is the derivative of the recorded volume."]
+
+
+def _smooth(flow: Floats) -> Floats:
+    """Flow of a breath without most of its noise, mL/s, ``(T,)``."""
+    smooth = without_noise(flow)
+    smooth[0] = flow[0]  # the rise behind it must not bias what the breath begins with
+    return smooth
 
 
 def _open(time: Floats, flow: Floats) -> float:
@@ -113,7 +120,8 @@ def _open(time: Floats, flow: Floats) -> float:
 def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
     """Breaths on the grid that a fit uses, with a shut expiratory valve.
 
-    Between two readings the flow stands at its mean, and shortly before a reading as it is there.
+    Between two readings the command stands for the mean of the flow, and shortly before a reading
+    for what it is there, both less its noise; ``flow`` has that.
 
     Args:
         breaths: n breaths of :func:`with_flow`.
@@ -126,7 +134,8 @@ def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
     places, counts = [], []
     for i in range(len(breaths)):
         length = int(breaths.valid[i].sum())
-        time, flow = breaths.time[i, :length], breaths.flow[i, :length]  # type: ignore[index]
+        time, raw = breaths.time[i, :length], breaths.flow[i, :length]  # type: ignore[index]
+        flow = _smooth(raw)
         step = float(np.median(np.diff(time)))  # even readings, so that few substeps suffice
         every = step * max(int(_READINGS / step + 1e-6), -int(-time[-1] // (_MOST * step)), 1)
         picked = np.searchsorted(time, np.arange(0.0, time[-1], every) - 0.25 * step)
@@ -142,7 +151,7 @@ def drive_grid(breaths: Breaths) -> tuple[Breaths, Ints]:
         rows["time"].append(nodes)
         rows["u_in"].append(np.append(means, flow[-1]) / _gain())
         rows["pressure"].append(pressure)
-        rows["flow"].append(np.interp(nodes, time, flow))
+        rows["flow"].append(np.interp(nodes, time, raw))
         places.append(np.searchsorted(time, nodes + 1e-9) - 1)
         counts.append(len(nodes))
     lengths = np.array(counts)
@@ -179,6 +188,34 @@ def initial_flow(driven: Breaths) -> Floats:
     """Flow into the lung at the first sample, mL/s, ``(n,)``: not zero where gas is trapped."""
     assert driven.flow is not None
     return driven.flow[:, 0]
+
+
+def of_noise(driven: Breaths, R: Floats) -> Floats:
+    """Pressure of the noise that smoothing took off the flow, cmH2O, ``(n, T)``.
+
+    Smoothing is wrong where the flow bends. Under the flow as it was recorded, errors are larger
+    and have the mean zero if nothing is missing.
+
+    Args:
+        driven: breaths of :func:`drive_grid`.
+        R: fitted resistance, cmH2O/(L/s), ``(n,)``; NaN where none is.
+    """
+    assert driven.flow is not None
+    noise = driven.flow[:, 1:] - _gain() * driven.u_in[:, :-1]
+    return np.pad(np.nan_to_num(1e-3 * R[:, None] * noise), ((0, 0), (1, 0)))
+
+
+def most_alike(driven: Breaths) -> Ints:
+    """Other breath whose flow differs least in mean square from that of each, ``(n,)``.
+
+    Noise of a flow is in what is simulated: sorted by that, it alone would have a mean error. The
+    values of another breath sort as well without it.
+    """
+    assert driven.flow is not None
+    rows = np.ma.masked_array(driven.flow, ~driven.valid)
+    distances = np.stack([np.ma.mean((rows - row) ** 2, axis=1).filled(np.inf) for row in rows])
+    np.fill_diagonal(distances, np.inf)
+    return np.argmin(distances, axis=1)
 
 
 def trapped_gas_notes(driven: Breaths, R: Floats) -> list[str]:
@@ -248,7 +285,7 @@ def lung_side_settings(settings: SelectionConfig, breaths: Breaths) -> Selection
     chosen = settings.search.nonparametric_terms
     terms = tuple(t for t in (chosen or basis_terms()) if not _is_of_ventilator(t))
     flow = _recorded_flow(breaths)[0]
-    noise = float(np.median([noise_of(x[np.isfinite(x)]) for x in flow]))
+    noise = float(np.median([noise_of(x) for x in flow]))
     search = replace(
         settings.search, nonparametric_terms=terms, ventilator=(), drive_noise=_LEFT * noise
     )

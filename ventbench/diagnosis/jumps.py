@@ -18,19 +18,11 @@ from __future__ import annotations
 import numpy as np
 
 from ventbench.base.arrays import Floats
+from ventbench.recordings.bad_samples import noise_of
 
 #: Numbers of samples of the windows; half-width of the confidence intervals in standard deviations;
 #: and samples over whose mean no volume may be lost.
 _WINDOWS, _WIDTH, _MEAN = (1, 3, 4, 6, 8, 11, 15, 20), 1.5, np.ones(11)
-
-
-def noise_of(signal: Floats) -> float:
-    """Standard deviation of the white noise of evenly spaced readings, by second differences.
-
-    Zero of two readings and fewer.
-    """
-    bends = np.abs(np.diff(signal, 2)) if len(signal) > 2 else np.zeros(1)
-    return 1.4826 * float(np.median(bends)) / np.sqrt(6.0)
 
 
 def without_noise(signal: Floats) -> Floats:

@@ -97,6 +97,7 @@ def locate(
     flow: Floats,
     volume: Floats,
     *,
+    sorted_by: Ints | None = None,
     settings: ResidualSettings = DEFAULT.residuals,
     least: float = 0.0,
 ) -> tuple[ErrorRegion, ...]:
@@ -114,6 +115,8 @@ def locate(
         noise_sd: standard deviation of the measurement, cmH2O.
         flow: flow of the refitted simulator, mL/s, ``(n, T)``.
         volume: volume of the refitted simulator, mL, ``(n, T)``.
+        sorted_by: breath by whose pressure, flow and volume each is sorted, ``(n,)``; itself if
+            None.
         settings: ranges and levels.
         least: root-mean-square error, cmH2O, that a mean error must add to the noise.
 
@@ -124,7 +127,8 @@ def locate(
     error, usable = errors(breaths, refit)
     if len(breaths) < settings.min_breaths or not usable.any():
         return ()
-    all_axes = axes(breaths, refit, flow, volume)
+    like = slice(None) if sorted_by is None else sorted_by
+    all_axes = axes(breaths, refit[like], flow[like], volume[like])
     columns = [_test_columns(axis, error, usable) for axis in all_axes]
     mean, excess, outside = (np.concatenate(part, axis=1) for part in zip(*columns, strict=True))
     variance = noise_sd**2

@@ -278,6 +278,7 @@ def check_residuals(
     flow: Floats,
     volume: Floats,
     *,
+    sorted_by: Ints | None = None,
     judged: Excess | None = None,
     gains_scatter: bool,
     settings: ResidualSettings,
@@ -292,6 +293,7 @@ def check_residuals(
         noise_sd: standard deviation of the measurement, cmH2O.
         flow: flow of the refitted simulator, mL/s, ``(n, T)``.
         volume: volume of the refitted simulator, mL, ``(n, T)``.
+        sorted_by: see :func:`locate`.
         judged: what breaths that are not here show beyond noise.
         gains_scatter: whether gains that differ from breath to breath are no error.
         settings: levels and ranges.
@@ -307,6 +309,7 @@ def check_residuals(
         noise_sd,
         flow,
         volume,
+        sorted_by=sorted_by,
         settings=settings,
         least=settings.negligible,
     )

@@ -40,6 +40,10 @@ _AGAIN, _MOST, _APART = 3, 0.2, 0.1
 #: deviations of the noise, and this share of the inner range.
 _SPANS, _DEVIATIONS, _RANGE = 4.0, 12.0, 0.03
 
+#: Samples on either side whose reversals tell how large those of the signal are: as the largest of
+#: them, but for those that other isolated readings among them make.
+_AROUND, _HIDING = 10, 3
+
 #: Standard deviations of the noise from which on a neighbour of a zero is not near zero.
 _AWAY = 4.0
 
@@ -134,11 +138,11 @@ def find_bad_samples(
             if signal.is_slow:
                 add("slow", _repeats(values))
             else:
-                isolated = signal.isolated()
-                if "u_in" in columns:
-                    isolated &= ~_pulses(columns["u_in"])
                 if name != "volume":  # which begins at zero
                     add("mark", signal.zeros())
+                isolated = signal.isolated(bad)
+                if "u_in" in columns:
+                    isolated &= ~_pulses(columns["u_in"])
                 add("isolated", isolated)
         if schema and (out := COLUMNS[name].outside(schema[name]) & ~bad).mean() <= _NOTABLE:
             add("isolated", out)
@@ -254,31 +258,40 @@ class _Signal:
         distinct = len(kinds) >= _DISTINCT and high > low
         marks = tuple(kinds[apart & often].tolist()) if distinct else ()
         good = finite[~np.isin(finite, marks)] if marks else finite
-        bends = np.abs(np.diff(good, 2))
-        noise = float(np.median(bends)) / (0.6745 * np.sqrt(6.0)) if len(bends) else 0.0
         inner = gaps[1:-1][(kinds[1:] > low) & (kinds[1:] < high)]
         resolution = float(np.median(inner)) if len(inner) else 0.0
-        return cls(values, float(high - low), noise, resolution, marks)
+        return cls(values, float(high - low), noise_of(good), resolution, marks)
 
-    def isolated(self) -> Bools:
+    def isolated(self, bad: Bools) -> Bools:
         """Samples far outside of what the three on both sides of them span, but one of them.
 
-        Zeros that follow one another are one sample. One that is found hides others no more.
+        So are those from which the signal comes back much farther than between the others. Zeros
+        that follow one another are one sample. One that is found, or bad, hides others no more.
         """
-        out = np.isin(self.values, self.marks)
+        out = bad.copy()
         for _ in range(_PASSES if self.span > 0.0 else 0):
             left = np.isfinite(self.values) & ~out
             first = left & ~((self.values == 0.0) & _repeats(self.values))
             centre = self.values[first]
-            padded = np.pad(centre, 3, mode="edge")  # at an end nothing is isolated
+            padded = np.pad(centre, _AROUND, mode="edge")  # at an end nothing is isolated
             limit = _DEVIATIONS * self.noise + max(_RANGE * self.span, 3.0 * self.resolution)
             steps = np.abs(np.diff(centre, prepend=centre[0], append=centre[-1])) > limit
             some = np.flatnonzero(steps[1:] | steps[:-1])  # others cannot be far from five of six
-            neighbours = np.sort(padded[some[:, None] + np.array([0, 1, 2, 4, 5, 6])], axis=1)
+            window = np.delete(np.arange(2 * _AROUND + 1), _AROUND)
+            around = padded[some[:, None] + window]
+            neighbours = np.sort(around[:, _AROUND - 3 : _AROUND + 3], axis=1)
             low, high = neighbours[:, 1], neighbours[:, 4]
             beyond = np.maximum(centre[some] - high, low - centre[some])
+            # On an edge neighbours span much, but a signal does not go there and back at once, or
+            # it does so again and again.
+            here = padded[some[:, None] + np.arange(_AROUND - 1, _AROUND + 2)]
+            back, others = _reversals(here)[:, 0], np.sort(_reversals(around), axis=1)[:, -_HIDING]
+            steps = np.abs(np.diff(around, axis=1))[:, [_AROUND - 2, _AROUND]]
+            nearer = np.argmin(np.abs(np.diff(here, axis=1)), axis=1)
+            others = np.maximum(others, steps[np.arange(len(some)), nearer])
+            remote = (beyond > limit + _SPANS * (high - low)) | (back > limit + _SPANS * others)
             found = np.zeros(len(centre), bool)
-            found[some[beyond > limit + _SPANS * (high - low)]] = True
+            found[some[remote]] = True
             remote = left & found[np.cumsum(first) - 1]
             if remote.sum() <= _MOST * left.sum():
                 out |= remote
@@ -312,9 +325,25 @@ class _Signal:
         return bool((np.abs(lengths - usual) <= (usual > 2)).mean() >= _REGULAR)
 
 
+def noise_of(readings: Floats) -> float:
+    """Standard deviation of the white noise of evenly spaced readings, by second differences.
+
+    Curvature is part of it. Zero of two readings and fewer; blanks are NaN.
+    """
+    bends = np.abs(np.diff(readings[np.isfinite(readings)], 2))
+    return 1.4826 * float(np.median(bends)) / np.sqrt(6.0) if len(bends) else 0.0
+
+
 def _repeats(values: Floats) -> Bools:
     """Whether a value is exactly the one before, ``(m,)``."""
     return np.append(False, values[1:] == values[:-1])
+
+
+def _reversals(values: Floats) -> Floats:
+    """By how much inner values lie on one side of both neighbours; 0 if between, ``(k, m - 2)``."""
+    steps = np.diff(values, axis=1)
+    turns = steps[:, :-1] * steps[:, 1:] < 0.0
+    return np.where(turns, np.minimum(np.abs(steps[:, :-1]), np.abs(steps[:, 1:])), 0.0)
 
 
 def _pulses(u_in: Floats) -> Bools:
@@ -386,7 +415,8 @@ def repeated_rows(columns: Columns) -> Bools:
     """Rows that are the row before once more, ``(m,)``.
 
     With a clock, the time is the same too. Without one, a row may also be held while the time goes
-    on: then the signal jumps by two steps behind it, else by one.
+    on: twice the usual time has then passed at the row behind. Lines through three rows on both
+    sides tell which is likelier, by residuals with the tails of Cauchy's distribution.
     """
     repeats = np.logical_and.reduce([_repeats(values) for values in columns.values()])
     if "time" in columns:
@@ -397,13 +427,11 @@ def repeated_rows(columns: Columns) -> Bools:
         return none
     single = np.flatnonzero(repeats[1:-2] & ~repeats[:-3] & ~repeats[2:-1]) + 1
     single = single[(single > 2) & (single < len(repeats) - 3)]
-    jumps = slopes = 0.0
+    nats = 0.0
     for values in measured:
-        slope = 0.25 * (
-            values[single - 1] - values[single - 3] + values[single + 3] - values[single + 1]
-        )
-        finite = np.isfinite(slope) & np.isfinite(values[single + 1] - values[single])
-        size = max(float(np.nanvar(values)), 1e-12)
-        jumps += float((slope * (values[single + 1] - values[single]))[finite].sum()) / size
-        slopes += float((slope**2)[finite].sum()) / size
-    return repeats if slopes > 0.0 and jumps < 1.5 * slopes else none
+        around, noise = values[single[:, None] + np.array([-3, -2, -1, 1, 2, 3])], noise_of(values)
+        for passed, sign in ((1.0, -1.0), (2.0, 1.0)):
+            line = np.vander([-2.0, -1.0, 0.0, passed, passed + 1.0, passed + 2.0], 2)
+            off = around - around @ np.linalg.pinv(line).T @ line.T
+            nats += sign * float(np.nansum(np.log(noise**2 + np.sum(off**2, axis=1))))
+    return repeats if nats > 0.0 else none

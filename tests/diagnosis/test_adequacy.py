@@ -103,6 +103,7 @@ def test_p_values_of_exchangeable_breaths_are_uniform():
     assert order_p_value(rng.normal(5.0 * lungs, 1.0), lungs) > 0.05
     assert order_p_value(rng.normal(5.0 * lungs, 1.0), GROUPS) < 0.001
     assert order_p_value(np.arange(4.0), GROUPS[:4]) == 1.0, "too few breaths to tell"
+    assert order_p_value(np.zeros(BREATHS), GROUPS) == 1.0, "equal values have no order"
 
 
 def test_false_discovery_rate_by_hand():

@@ -54,6 +54,9 @@ class Correction:
 
     #: pressures of the simulator ``before``, ``refit`` and ``after``, cmH2O, ``(n, T)`` each.
     pressures: dict[str, Floats]
+    #: those whose residuals tell what is missing: where the judge leaves the base model as it is
+    #: given, it is refitted, since a label that is a little off is no missing physics.
+    tested: Floats
     #: mean absolute error of the simulator as given and of the correction, before any choice, on
     #: the breaths of the final fits, inspirations and expirations, cmH2O.
     training_errors: tuple[float, float]
@@ -112,13 +115,15 @@ def correct(
         "refit": by_lung(breaths, pressures, refitted),
         "after": by_lung(breaths, pressures, chosen),
     }
+    given = "refit" if simulator_model is None else "before"
+    tested = by_lung(breaths, pressures | {"before": pressures[given]}, chosen)
     if not simulators.has_plants:
         note = (
             f"There is no corrected.json, since no plant stands behind {simulators.name} that "
             "could be corrected; the corrected pressures of the recorded breaths are in the "
             "diagnosis."
         )
-        return Correction(final, errors, {}, chosen, unchanged, (*notes, note))
+        return Correction(final, tested, errors, {}, chosen, unchanged, (*notes, note))
     # Plants of one kind can be run together: the base model is the library's physics here.
     uncorrected = {
         name: simulators.plant(name)
@@ -136,7 +141,7 @@ def correct(
         else:
             of_stage = plants[stage].items()
             result |= {key: plant for key, plant in of_stage if parse_rig_id(key)[0] == name}
-    return Correction(final, errors, result, chosen, unchanged, tuple(notes))
+    return Correction(final, tested, errors, result, chosen, unchanged, tuple(notes))
 
 
 _NOTE_ON_DRIFT = (

@@ -363,10 +363,10 @@ def _conclude(
     nuisance = np.stack([start, gain] if scattered else [start], axis=-1)
     judged = None  # efforts of breaths to come are unknown
     if not conclusion.full.hypothesis.breath_terms:
-        judged = judge.excess(pressures["after"] + of_drive, nuisance, quiet_samples(breaths))
+        judged = judge.excess(correction.tested + of_drive, nuisance, quiet_samples(breaths))
     adequacy = check_residuals(
         breaths.select(tested),
-        (pressures["after"] + of_drive)[tested],
+        (correction.tested + of_drive)[tested],
         gain[tested],
         start[tested],
         noise.sigma[0],

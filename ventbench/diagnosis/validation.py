@@ -371,7 +371,9 @@ def order_p_value(
     permuted = np.zeros((settings.flips + 1, n), np.float32)  # as recorded, then permuted
     for group in np.unique(groups):
         members = np.flatnonzero(groups == group)
-        ranks = np.argsort(np.argsort(values[members])) - 0.5 * (len(members) - 1)
+        of_lung = np.sort(values[members])  # equal values have the mean of their ranks
+        sides = [np.searchsorted(of_lung, values[members], side) for side in ("left", "right")]
+        ranks = 0.5 * (sides[0] + sides[1] - len(members))
         ranks = ranks / max(float(np.std(ranks)), 1e-12)
         permuted[0, members] = ranks
         permuted[1:, members] = rng.permuted(np.tile(ranks, (settings.flips, 1)), axis=1)

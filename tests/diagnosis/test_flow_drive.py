@@ -180,8 +180,10 @@ def test_trapped_gas_drives_the_simulator_too():
 
 def test_what_smoothing_takes_off_the_flow_is_known_as_pressure():
     breaths = recorded(3)
+    assert breaths.flow is not None
     noise = np.random.default_rng(1).normal(0.0, 5.0, breaths.flow.shape)
     noisy, _ = flow_drive.with_flow(dataclasses.replace(breaths, flow=breaths.flow + noise))
+    assert noisy.flow is not None
     driven, index = flow_drive.drive_grid(noisy)
     of_noise = flow_drive.of_noise(driven, np.array([20.0, 40.0, np.nan]))
     readings = np.isfinite(driven.pressure)

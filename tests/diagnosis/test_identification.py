@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ventbench.base.errors import InputError
-from ventbench.diagnosis import identification
 from ventbench.diagnosis.experiment import held_out, split, usable
 from ventbench.diagnosis.settings import DEFAULT
 
@@ -104,39 +101,3 @@ def test_breaths_that_judged_an_earlier_correction_judge_again():
     assert not (uses.judging & uses.testing).any()
     everything = tuple(breaths.breath_id.tolist())
     assert np.array_equal(split(breaths, never_fitted=everything).judging, split(breaths).judging)
-
-
-@pytest.mark.parametrize(
-    ("term", "nats", "idle"),
-    [
-        ("supply_memory", 5.0, True),
-        ("supply_memory", 50.0, False),
-        ("leak_shape", 5.0, False),
-        (None, 5.0, False),
-    ],
-)
-def test_a_term_that_adds_little_to_a_mechanism_it_contains_is_idle(term, nats, idle):
-    unnamed = SimpleNamespace(term=term, nats=nats)
-    conclusion: Any = SimpleNamespace(unnamed=unnamed, held_out_gains={"supply_droop": 100.0})
-    assert identification._is_idle_form(conclusion, "supply_droop", DEFAULT) is idle
-    nothing: Any = SimpleNamespace(unnamed=None, held_out_gains={})
-    assert not identification._is_idle_form(nothing, "supply_droop", DEFAULT)
-
-
-@pytest.mark.parametrize(
-    ("inertance", "nats", "negligible"),
-    [(0.005, 12.0, True), (0.02, 12.0, False), (0.005, 500.0, False)],
-)
-def test_what_the_final_fit_leaves_negligible_is_not_named(inertance, nats, negligible):
-    """A fifth of a mild inertance is 0.008 cmH2O s2/L."""
-    unknowns = SimpleNamespace(paths=("inertance.inertance",))
-    fit: Any = SimpleNamespace(
-        problem=SimpleNamespace(unknowns=unknowns), value=lambda path: np.array([inertance])
-    )
-    gains = {"valve_lag": 3000.0, "inertance": nats}
-    conclusion: Any = SimpleNamespace(held_out_gains=gains)
-    assert identification._is_negligible(fit, conclusion, "inertance", DEFAULT) is negligible
-    # An effort is another in each breath: its size is no strength of the rig.
-    assert not identification._is_negligible(fit, conclusion, "patient_effort", DEFAULT)
-    alone: Any = SimpleNamespace(held_out_gains={"inertance": nats})
-    assert not identification._is_negligible(fit, alone, "inertance", DEFAULT)

@@ -10,9 +10,6 @@ import pytest
 from hardware_eval.emulation.cases import Base
 from ventbench.diagnosis import validation
 from ventbench.diagnosis.conclusion import eliminate
-from ventbench.diagnosis.evaluator import (
-    fit_with_noise,
-)
 from ventbench.diagnosis.hypothesis import Hypothesis
 from ventbench.diagnosis.settings import HeldOutTestSettings
 from ventbench.diagnosis.validation import passes_heldout_test
@@ -43,24 +40,6 @@ def test_cross_validation_runs_only_where_the_training_breaths_clearly_ask(
     assert len(asked) == 1
     assert not validation.is_needed(turbulent, *reversed(both))
     assert len(asked) == 1
-
-
-def test_a_negligible_term_is_far_weaker_than_mild_and_explains_little(turbulent, both):
-    named, _ = both
-    two = turbulent.fit(Hypothesis(("turbulent_resistance", "sensor_drift")), named.noise, named)
-    assert abs(two.column("sensor_drift.drift")[0]) < 0.2 * 1.2
-    assert validation.is_negligible(turbulent, two, named, "sensor_drift")
-    without = turbulent.fit(two.hypothesis.minus("turbulent_resistance"), two.noise, two)
-    assert not validation.is_negligible(turbulent, two, without, "turbulent_resistance")
-
-
-def test_a_weak_term_that_explains_nearly_all_is_not_negligible():
-    evaluator = small.split(small.made(small.effect("valve_dead_band", width=0.28), noise=0.02))
-    weak = fit_with_noise(evaluator, Hypothesis(("valve_dead_band",)))
-    assert weak.column("valve_dead_band.width")[0] < 0.2 * 1.5
-    without = evaluator.fit(Hypothesis(), weak.noise, weak)
-    assert evaluator.criterion(without) - evaluator.criterion(weak) > 100.0
-    assert not validation.is_negligible(evaluator, weak, without, "valve_dead_band")
 
 
 THRESHOLD = HeldOutTestSettings().threshold

@@ -23,7 +23,7 @@ from ventbench.diagnosis.linearised import EFFORT, Term, names_of
 from ventbench.diagnosis.unknown import preference, unplaced_gain
 from ventbench.diagnosis.validation import (
     is_needed,
-    is_negligible,
+    is_plausible,
     passes_heldout_test,
 )
 from ventbench.physics.catalogue import basis_terms, library, mechanism
@@ -269,7 +269,7 @@ def eliminate(
         if evaluator.white:  # its likelihood counts a slow error once for each sample
             least = settings.held_out_test.threshold / WARMTH
             helps = worth > 0.0 and float(gains.sum()) > least
-            return gains, worth, helps and not is_negligible(evaluator, model, reduced, name)
+            return gains, worth, helps and is_plausible(model, name, settings.plausibility)
         if before - after <= _filtered(evaluator, model) or not is_needed(
             evaluator, model, reduced
         ):
@@ -277,7 +277,7 @@ def eliminate(
         if name in basis_terms():
             least = max(settings.search.least_change, 0.5 * model.noise.sigma[0])
             return gains, worth, before - after > least**2 or len(model.names) == 1
-        return gains, worth, not is_negligible(evaluator, model, reduced, name)
+        return gains, worth, is_plausible(model, name, settings.plausibility)
 
     while True:
         results = {n: compared(n) for n in model.names if judged is None or n in judged}

@@ -19,8 +19,8 @@ from ventbench.diagnosis.hypothesis import (
     varies_by_breath,
 )
 from ventbench.diagnosis.settings import DEFAULT, SelectionConfig
-from ventbench.diagnosis.validation import excludes_neutral, is_weak
-from ventbench.physics.catalogue import mechanism, special_cases
+from ventbench.diagnosis.validation import excludes_neutral
+from ventbench.physics.catalogue import mechanism
 from ventbench.system_id import START, Fit, likely_places
 from ventbench.system_id.data import Data
 from ventbench.system_id.levenberg_marquardt import minimise
@@ -101,20 +101,12 @@ def identify(
         # A nonparametric term is fitted to the training breaths alone, to save time.
         final = evaluator.training if has_term else evaluator.partition(data.select(chosen))
         fit = estimates.final_fit(conclusion.full, final, evaluator)
-        vague = [
-            name
-            for name in conclusion.names
-            if not _is_definite(fit, name) or _is_negligible(fit, conclusion, name, settings)
-        ]
+        vague = [name for name in conclusion.names if not _is_definite(fit, name)]
         if not vague:
             return IdentifiedModel(evaluator, _with_changes_of(conclusion, fit), fit, final)
         # The least needed one first: the intervals of others may shrink once it has gone.
         name = min(vague, key=lambda name: conclusion.held_out_gains.get(name, 0.0))
-        if _is_idle_form(conclusion, name, settings):
-            named = conclusion.named
-            conclusion = replace(conclusion, full=named, unnamed=None, noise=named.noise)
-        else:
-            conclusion = drop_mechanism(conclusion, name, evaluator)
+        conclusion = drop_mechanism(conclusion, name, evaluator)
 
 
 def _with_changes_of(conclusion: Conclusion, fit: Fit) -> Conclusion:
@@ -167,33 +159,6 @@ def first_after(place: Interval, position: Floats, ids: Ints) -> tuple[int, int,
     last = len(ids) - 1
     earliest = int(ids[low - 1]) + 1 if low else int(ids[0])
     return int(ids[min(now, last)]), earliest, int(ids[min(high, last)])
-
-
-def _is_idle_form(conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:
-    """Whether a nonparametric term contains a mechanism and adds little to it.
-
-    Beside such a term, the mechanism's strength may be anything: the term can do all that it does.
-    """
-    unnamed = conclusion.unnamed
-    if unnamed is None or unnamed.term is None or name not in special_cases(unnamed.term):
-        return False
-    share = settings.held_out_test.negligible_share
-    return unnamed.nats < share * conclusion.held_out_gains.get(name, 0.0)
-
-
-def _is_negligible(fit: Fit, conclusion: Conclusion, name: str, settings: SelectionConfig) -> bool:
-    """Whether the final fit leaves a mechanism far weaker than a mild one, that explains little.
-
-    Gas that rings has several minima; a fit to more breaths may end in that of a much smaller
-    inertance than the selection weighed.
-    """
-    strength, limits = mechanism(name).description.strength, settings.held_out_test
-    path = f"{name}.{strength.name}"
-    if varies_by_breath(name) or path not in fit.problem.unknowns.paths:
-        return False
-    beyond, gains = fit.value(path) - strength.neutral, conclusion.held_out_gains
-    little = gains.get(name, 0.0) < limits.negligible_share * sum(gains.values())
-    return little and is_weak(name, beyond, limits.negligible_strength)
 
 
 def _is_definite(fit: Fit, name: str) -> bool:

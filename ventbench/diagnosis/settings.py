@@ -108,9 +108,9 @@ class HeldOutTestSettings:
     clear_criterion: float = 20.0
     #: times the threshold that cross-validation must pass, since its folds share breaths.
     cross_validation_factor: float = 1.5
-    #: share of a mild strength below which a term may be negligible.
+    #: share of a mild strength below which a term that a simulator has may differ from its own.
     negligible_strength: float = 0.2
-    negligible_share: float = 0.1  #: share of the whole explained criterion below which it then is.
+    negligible_share: float = 0.1  #: share of what all terms gain below which it then is no other.
 
 
 @dataclass(frozen=True)

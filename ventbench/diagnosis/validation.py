@@ -40,7 +40,6 @@ from ventbench.diagnosis.evaluator import Evaluator, cross_validated_gain
 from ventbench.diagnosis.findings import Change, ErrorRegion, Quantity
 from ventbench.diagnosis.hypothesis import (
     FittedModel,
-    Hypothesis,
     Linearisation,
     linearise,
     varies_by_breath,
@@ -177,31 +176,6 @@ def is_needed(evaluator: Evaluator, full: FittedModel, reduced: FittedModel) -> 
         settings,
         settings.cross_validation_factor * settings.threshold,
     )
-
-
-def is_negligible(evaluator: Evaluator, full: FittedModel, reduced: FittedModel, name: str) -> bool:
-    """Whether a term is implausible, or far weaker than a mild one and explains little.
-
-    A tiny effect of almost any kind can reduce an error of the integrator, or of another term's
-    form, and with enough breaths it passes the held-out test: a valve that is late by 1 ms beside
-    four strong effects.
-
-    Args:
-        evaluator: evaluator of the recording.
-        full: a hypothesis with the term.
-        reduced: the hypothesis without the term, at the same noise.
-        name: name of the term.
-    """
-    if not is_plausible(full, name, evaluator.settings.plausibility):
-        return True
-    settings = evaluator.settings.held_out_test
-    strength = mechanism(name).description.strength
-    beyond = full.column(f"{name}.{strength.name}") - strength.neutral
-    if varies_by_breath(name) or not is_weak(name, beyond, settings.negligible_strength):
-        return False
-    criterion = evaluator.criterion(full)
-    base = evaluator.criterion(evaluator.fit(Hypothesis(), full.noise, full))
-    return evaluator.criterion(reduced) - criterion < settings.negligible_share * (base - criterion)
 
 
 def detection_limits(evaluator: Evaluator, fitted: FittedModel) -> dict[str, float]:

@@ -415,7 +415,7 @@ def repeated_rows(columns: Columns) -> Bools:
     """Rows that are the row before once more, ``(m,)``.
 
     With a clock, the time is the same too. Without one, a row may also be held while the time goes
-    on: twice the usual time has then passed at the row behind. Lines through three rows on both
+    on: twice the usual time has then passed at the row behind. Lines through four rows on both
     sides tell which is likelier, by residuals with the tails of Cauchy's distribution.
     """
     repeats = np.logical_and.reduce([_repeats(values) for values in columns.values()])
@@ -426,12 +426,13 @@ def repeated_rows(columns: Columns) -> Bools:
     if len(measured) < 2 or repeats.sum() < 10.0 * (1.0 + len(repeats) * chance):
         return none
     single = np.flatnonzero(repeats[1:-2] & ~repeats[:-3] & ~repeats[2:-1]) + 1
-    single = single[(single > 2) & (single < len(repeats) - 3)]
+    single = single[(single > 3) & (single < len(repeats) - 4)]
     nats = 0.0
     for values in measured:
-        around, noise = values[single[:, None] + np.array([-3, -2, -1, 1, 2, 3])], noise_of(values)
+        around = values[single[:, None] + np.delete(np.arange(-4, 5), 4)]
+        least = noise_of(values) ** 2
         for passed, sign in ((1.0, -1.0), (2.0, 1.0)):
-            line = np.vander([-2.0, -1.0, 0.0, passed, passed + 1.0, passed + 2.0], 2)
+            line = np.vander(np.append(np.arange(-3.0, 1.0), passed + np.arange(4.0)), 2)
             off = around - around @ np.linalg.pinv(line).T @ line.T
-            nats += sign * float(np.nansum(np.log(noise**2 + np.sum(off**2, axis=1))))
+            nats += sign * float(np.nansum(np.log(least + np.sum(off**2, axis=1))))
     return repeats if nats > 0.0 else none

@@ -136,6 +136,15 @@ def test_a_spike_on_an_edge_of_a_flow_is_found(row):
     assert (found.kind, found.rows.tolist()) == ("isolated", [row])
 
 
+def test_a_dip_before_a_rise_is_a_reading():
+    """It goes there and back at once, but goes on: a trigger, or a breath that begins anew."""
+    columns = signals()
+    columns["pressure"][np.arange(150, 1800, 150)] = 2.0
+    columns["pressure"][np.arange(151, 1800, 150)] = 9.0
+    columns["pressure"][np.arange(152, 1800, 150)] = 15.0
+    assert find_bad_samples(columns) == ()
+
+
 def test_a_spike_that_others_hide_is_found():
     columns = signals()
     rows = np.array([320, 322, 324])

@@ -282,14 +282,14 @@ class _Signal:
             neighbours = np.sort(around[:, _AROUND - 3 : _AROUND + 3], axis=1)
             low, high = neighbours[:, 1], neighbours[:, 4]
             beyond = np.maximum(centre[some] - high, low - centre[some])
-            # On an edge neighbours span much, but a signal does not go there and back at once, or
-            # it does so again and again.
+            # On an edge neighbours span much. A signal goes there and back at once where it does so
+            # again and again, or goes on as fast on one of the sides.
             here = padded[some[:, None] + np.arange(_AROUND - 1, _AROUND + 2)]
-            back, others = _reversals(here)[:, 0], np.sort(_reversals(around), axis=1)[:, -_HIDING]
-            steps = np.abs(np.diff(around, axis=1))[:, [_AROUND - 2, _AROUND]]
-            nearer = np.argmin(np.abs(np.diff(here, axis=1)), axis=1)
-            others = np.maximum(others, steps[np.arange(len(some)), nearer])
-            remote = (beyond > limit + _SPANS * (high - low)) | (back > limit + _SPANS * others)
+            there, on = (np.abs(np.diff(values, axis=1)) for values in (here, around))
+            back = (there - _SPANS * on[:, [_AROUND - 2, _AROUND]]).min(axis=1)
+            others = np.sort(_reversals(around), axis=1)[:, -_HIDING]
+            turns = (_reversals(here)[:, 0] > 0.0) & (back > limit + _SPANS * others)
+            remote = (beyond > limit + _SPANS * (high - low)) | turns
             found = np.zeros(len(centre), bool)
             found[some[remote]] = True
             remote = left & found[np.cumsum(first) - 1]

@@ -139,9 +139,9 @@ def test_a_spike_on_an_edge_of_a_flow_is_found(row):
 def test_a_dip_before_a_rise_is_a_reading():
     """It goes there and back at once, but goes on: a trigger, or a breath that begins anew."""
     columns = signals()
-    columns["pressure"][np.arange(150, 1800, 150)] = 2.0
-    columns["pressure"][np.arange(151, 1800, 150)] = 9.0
-    columns["pressure"][np.arange(152, 1800, 150)] = 15.0
+    starts, rng = np.arange(150, 1800, 150), np.random.default_rng(0)
+    for k, value in enumerate((2.5, 7.0, 11.0, 14.0, 17.0)):
+        columns["pressure"][starts + k] = value + rng.normal(0.0, 0.1, len(starts))
     assert find_bad_samples(columns) == ()
 
 

@@ -249,3 +249,12 @@ def test_rows_that_come_twice_are_told_from_rows_that_are_held(seed):
     for values in held.values():
         values[at] = values[at - 1]
     assert not repeated_rows(held).any()
+
+
+def test_rows_that_repeat_on_a_plateau_leave_the_question_open():
+    """All lines fit exactly: no logarithm of nothing, and nothing is left out."""
+    rng = np.random.default_rng(0)
+    wild = np.where(np.arange(2000) % 500 < 400, 7.0, rng.normal(0.0, 1e3, 2000))
+    columns = {"pressure": wild, "flow": np.round(wild, 2)}
+    assert not repeated_rows(columns).any()
+    assert not repeated_rows({name: 0.0 * values for name, values in columns.items()}).any()

@@ -430,7 +430,7 @@ def repeated_rows(columns: Columns) -> Bools:
     nats = 0.0
     for values in measured:
         around = values[single[:, None] + np.delete(np.arange(-4, 5), 4)]
-        least = noise_of(values) ** 2
+        least = max(noise_of(values), 1e-9) ** 2
         for passed, sign in ((1.0, -1.0), (2.0, 1.0)):
             line = np.vander(np.append(np.arange(-3.0, 1.0), passed + np.arange(4.0)), 2)
             off = around - around @ np.linalg.pinv(line).T @ line.T

@@ -110,6 +110,12 @@ def test_functions_get_the_flow_and_learned_simulators_are_refused():
     answers = flow_drive.simulate(load_simulators(lung), whole, driven, index)
     assert answers.shape == driven.time.shape
     assert np.isfinite(answers).all()
+    assert whole.flow is not None
+    noise = np.random.default_rng(0).normal(0.0, 5.0, whole.flow.shape)
+    noisy = dataclasses.replace(whole, flow=whole.flow + noise)
+    off = flow_drive.simulate(load_simulators(lung), noisy, driven, index) - answers
+    of_noise = R * 1e-3 * np.take_along_axis(noise, index, axis=1)
+    assert off.std() < 0.8 * of_noise.std(), "functions get the flow less its noise"
     with pytest.raises(InputError, match="frozen needs one"):
         flow_drive.simulate(load_simulators("frozen"), whole, driven, index)
 

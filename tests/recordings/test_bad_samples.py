@@ -155,11 +155,10 @@ def test_a_spike_that_others_hide_is_found():
 
 
 def test_no_flow_at_rest_is_a_reading_and_a_dead_sensor_is_not():
-    """A flow without noise, which follows the valve, is exactly zero in a lung at rest."""
+    """A flow without noise, which steps with the valve, is exactly zero in a lung at rest."""
     rng = np.random.default_rng(0)
     phase = np.tile(np.arange(0.0, 4.0, 0.04), 4)
-    valve = np.interp(np.arange(400), np.arange(0, 400, 5), rng.uniform(50.0, 500.0, 80))
-    flow = np.where(phase < 1.0, valve, 0.0)
+    flow = np.where(phase < 1.0, rng.uniform(50.0, 500.0, phase.size), 0.0)
     flow += np.where((phase > 1.0) & (phase < 2.0), -300.0 * np.exp(-3.0 * phase), 0.0)
     volume = np.where(phase < 1.0, 0.3 * phase, 0.3 * np.exp(-8.0 * np.maximum(phase - 1.0, 0.0)))
     pressure = 5.0 + 50.0 * volume + rng.normal(0.0, 0.05, phase.size)
@@ -249,12 +248,3 @@ def test_rows_that_come_twice_are_told_from_rows_that_are_held(seed):
     for values in held.values():
         values[at] = values[at - 1]
     assert not repeated_rows(held).any()
-
-
-def test_rows_that_repeat_on_a_plateau_leave_the_question_open():
-    """All lines fit exactly: no logarithm of nothing, and nothing is left out."""
-    rng = np.random.default_rng(0)
-    wild = np.where(np.arange(2000) % 500 < 400, 7.0, rng.normal(0.0, 1e3, 2000))
-    columns = {"pressure": wild, "flow": np.round(wild, 2)}
-    assert not repeated_rows(columns).any()
-    assert not repeated_rows({name: 0.0 * values for name, values in columns.items()}).any()

@@ -53,8 +53,8 @@ def lacks_commands(breaths: Breaths) -> bool:
 def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
     """Breaths whose ``flow`` has no gaps and whose ``u_in`` stands for the flow; and notes.
 
-    ``u_in`` is the command at which the base model's valve has the mean flow until the next sample,
-    less its noise; it is negative while gas leaves.
+    ``u_in`` is the command at which the base model's valve has the mean flow until the next sample;
+    it is negative while gas leaves.
 
     Raises:
         InputError: if no breath has flow or volume in its first sample, in at least half of all,
@@ -75,17 +75,19 @@ def with_flow(breaths: Breaths) -> tuple[Breaths, list[str]]:
         notes.append(
             f"{int((~good).sum())} breaths without flow, or with gaps in it, were left out."
         )
-    filled, smooth = np.zeros_like(flow), np.zeros_like(flow)
+    filled = np.zeros_like(flow)
     pressure = breaths.pressure.copy()
     for i in np.flatnonzero(good):
         filled[i] = np.interp(breaths.time[i], breaths.time[i, recorded[i]], flow[i, recorded[i]])
-        smooth[i] = _smooth(filled[i])
         last = np.flatnonzero(recorded[i])[-1]
         pressure[i, last + 1 :] = np.nan  # what flowed there is unknown
-    ahead = np.concatenate([smooth[:, 1:], smooth[:, -1:]], axis=1)
-    u_in = 0.5 * (smooth + ahead) / _gain()
-    complete = replace(breaths, flow=filled, u_in=u_in, pressure=pressure)
-    return complete.select(good), notes
+    return _commanding(replace(breaths, pressure=pressure), filled).select(good), notes
+
+
+def _commanding(breaths: Breaths, flow: Floats) -> Breaths:
+    """Breaths with a flow, mL/s, ``(n, T)``, for which ``u_in`` stands."""
+    ahead = np.concatenate([flow[:, 1:], flow[:, -1:]], axis=1)
+    return replace(breaths, flow=flow, u_in=0.5 * (flow + ahead) / _gain())
 
 
 def _recorded_flow(breaths: Breaths) -> tuple[Floats, list[str]]:
@@ -240,8 +242,8 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
     """Pressures of a simulator under the recorded flow, on the grid of a fit, cmH2O, ``(n, T)``.
 
     Args:
-        simulators: functions of commands get the flow as ``flow`` and as the ``u_in`` of a linear
-            valve.
+        simulators: functions of commands get the flow, less its noise, as ``flow`` and as the
+            ``u_in`` of a linear valve.
         recorded: breaths of :func:`with_flow`.
         driven: the same on the grid of :func:`drive_grid`.
         index: recorded sample of each of its samples.
@@ -250,7 +252,9 @@ def simulate(simulators: Simulators, recorded: Breaths, driven: Breaths, index: 
         InputError: if the simulator's valve cannot be driven by a flow.
     """
     if not isinstance(simulators, PlantSimulators):
-        return np.take_along_axis(simulators.pressures(recorded), index, axis=1)
+        smooth = np.stack([_smooth(flow) for flow in recorded.flow])  # type: ignore[union-attr]
+        pressures = simulators.pressures(_commanding(recorded, smooth))
+        return np.take_along_axis(pressures, index, axis=1)
     if simulators.is_base_physics or isinstance(simulators, OnePlant | PlantsByLung):
         return open_loop_breaths(lambda part: _breathing(simulators, part), driven)
     raise InputError(

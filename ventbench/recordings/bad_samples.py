@@ -40,9 +40,8 @@ _AGAIN, _MOST, _APART = 3, 0.2, 0.1
 #: deviations of the noise, and this share of the inner range.
 _SPANS, _DEVIATIONS, _RANGE = 4.0, 12.0, 0.03
 
-#: Samples on either side whose reversals tell how large those of the signal are: as the largest of
-#: them, but for those that other isolated readings among them make.
-_AROUND, _HIDING = 10, 3
+#: Samples on either side whose reversals tell how large those of the signal are.
+_AROUND = 10
 
 #: Standard deviations of the noise from which on a neighbour of a zero is not near zero.
 _AWAY = 4.0
@@ -287,7 +286,7 @@ class _Signal:
             here = padded[some[:, None] + np.arange(_AROUND - 1, _AROUND + 2)]
             there, on = (np.abs(np.diff(values, axis=1)) for values in (here, around))
             back = (there - _SPANS * on[:, [_AROUND - 2, _AROUND]]).min(axis=1)
-            others = np.sort(_reversals(around), axis=1)[:, -_HIDING]
+            others = _reversals(around).max(axis=1)
             turns = (_reversals(here)[:, 0] > 0.0) & (back > limit + _SPANS * others)
             remote = (beyond > limit + _SPANS * (high - low)) | turns
             found = np.zeros(len(centre), bool)

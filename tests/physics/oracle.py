@@ -19,7 +19,8 @@ def valve_positions(u_in, m):
     out, stands, asked, rests = [], 0.0, 0.0, 0.0
     for u in u_in:
         if "command_rounding" in m:
-            u = float(np.floor(u))
+            rule = {"step": 1.0, "bias": 0.0} | m["command_rounding"]
+            u = rule["step"] * float(np.floor(u / rule["step"] + rule["bias"]))
         dead = {"crack": 0.0, "driver": 0.0} | m.get("valve_dead_band", {})
         if dead["driver"]:
             u = remainder(u, dead["driver"] * dead["width"], dead["crack"])

@@ -55,6 +55,8 @@ def test_each_mechanism(name, level, predicted):
 @pytest.mark.parametrize(
     ("path", "value"),
     [
+        ("command_rounding.bias", 0.5),
+        ("command_rounding.step", 1.7),
         ("valve_lag.second", 0.06),
         ("sensor_lag.second", 0.06),
         ("inertance.tubing", 0.5),

@@ -93,9 +93,12 @@ def parameter_estimates(fitted: Fit, name: str) -> dict[str, Estimate]:
     values = {}
     for spec in mechanism(name).description.parameters:
         path = f"{name}.{spec.name}"
-        if path not in fitted.problem.unknowns.paths:
+        if spec.screened:
+            value, ratio = float(fitted.column(path)[0]), spec.grid[1] / spec.grid[0]
+            values[spec.name] = Estimate(value, spec.unit, (value / ratio, value * ratio))
+        elif path not in fitted.problem.unknowns.paths:
             continue
-        if spec.scope == "breath":
+        elif spec.scope == "breath":
             column = fitted.column(path)
             low, middle, high = np.quantile(column, [0.025, 0.5, 0.975])
             values[spec.name] = Estimate(float(middle), spec.unit, (float(low), float(high)))

@@ -37,6 +37,7 @@ from ventbench.diagnosis.linearised import (
     solve_lower,
     within,
 )
+from ventbench.diagnosis.screening import screened_points
 from ventbench.physics.catalogue import basis_terms, library, mechanism
 from ventbench.system_id.data import Data, Noise
 from ventbench.system_id.problem import parameter_of
@@ -387,7 +388,14 @@ class _Search:
     def around(self, fitted: FittedModel) -> CandidateEffects:
         """All candidates, simulated around a fit."""
         events = [name for name in EVENTS if name not in self.excluded]
-        return simulate(self.data, self.predictor, fitted, self.names, self.unnamed or (), events)
+        screened = {
+            name: screened_points(fitted, name)
+            for name in self.names
+            if any(p.screened for p in mechanism(name).description.parameters)
+            and name not in fitted.names
+        }
+        unnamed = self.unnamed or ()
+        return simulate(self.data, self.predictor, fitted, self.names, unnamed, events, screened)
 
     def linear_model(
         self,

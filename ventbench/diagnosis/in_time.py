@@ -300,7 +300,8 @@ def _commands(model: LinearModel, partition: Partition, around: FittedModel) -> 
     problem, x, share = replace(around.problem, noise=model.noise), around.minimum.x, 0.1
     for name, (expected, lags) in _COMMANDS.items():
         candidates = [follow(problem, x, partition, share, lag) for lag in lags]
-        best = max(candidates, key=lambda paths: float(paths.nats.sum()))
+        nats = np.array([paths.nats.sum() for paths in candidates])
+        best = candidates[int(np.argmax(nats))]
         missed, sent = float(best.missed.sum()), float(best.sent.sum())
         if not missed or ask_for_little(best, data.u_in) <= EXCHANGEABLE:
             break
@@ -308,7 +309,8 @@ def _commands(model: LinearModel, partition: Partition, around: FittedModel) -> 
         reached = partition.predictor.of(replace(data, u_in=best.u_in))
         column = reached.predict(values)[:, 0] - partition.predictor.predict(values)[:, 0]
         odds = missed * np.log(share) + max(sent - missed, 0.0) * np.log1p(-share)
-        odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2 + np.log(len(lags))
+        odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2
+        odds += np.logaddexp.reduce(nats - nats.max()) - np.log(len(lags))  # whatever the delay
         terms.append(Term(name, [1.0], odds=float(odds), latent=[column]))
     return terms
 
@@ -381,6 +383,18 @@ def input_responses(partition: Partition, values: Floats, place: str) -> Floats:
     return responses
 
 
+def command_responses(partition: Partition, values: Floats) -> Floats:
+    """Change of each reading by 1 % more of each command, cmH2O, ``(n, T, T)``, command first.
+
+    Args:
+        partition: n breaths of T samples.
+        values: physical values of its parameters, ``(n, P + 1)``.
+    """
+    unit = replace(partition.data, u_in=np.ones_like(partition.data.u_in))
+    by_supply = input_responses(replace(partition, data=unit), values, SUPPLY)
+    return np.pad(by_supply[:, 1:], ((0, 0), (0, 1), (0, 0)))  # a command is read one sample later
+
+
 class Paths(NamedTuple):
     """What lost or late commands do for n breaths."""
 
@@ -404,9 +418,7 @@ def follow(
     """
     data, noise = partition.data, problem.noise
     n, samples = data.u_in.shape
-    unit = replace(partition, data=replace(data, u_in=np.ones_like(data.u_in)))
-    by_command = np.zeros((n, samples, samples))  # (n, command, reading)
-    by_command[:, :-1] = input_responses(unit, problem.values(x), SUPPLY)[:, 1:]
+    by_command = command_responses(partition, problem.values(x))
     white = noise.whiten(by_command[:, :, None], data.weight)[:, :, 0]
     first = noise.whiten(problem.residual(x), data.weight)
     residuals = np.repeat(first, _PATHS, axis=1)  # (n, b, T)

@@ -167,6 +167,7 @@ def simulate(
     names: Sequence[str],
     unnamed: Sequence[str],
     events: Collection[str],
+    screened: Mapping[str, Sequence[dict[str, float]]],
 ) -> CandidateEffects:
     """Simulate all candidates around a fit; what it has is no candidate.
 
@@ -177,6 +178,7 @@ def simulate(
         names: mechanisms that all breaths share.
         unnamed: basis terms.
         events: effects of some breaths.
+        screened: points of mechanisms of which a parameter is screened.
     """
     values, order = around.values, (*predictor.names, START)
     perturbed, scale = [values], {0: 0.01}
@@ -198,7 +200,11 @@ def simulate(
             scale[k], basis[k] = 0.1 * spread, (path, spread)
             of_basis.setdefault(name, []).append(k)
     candidates = [n for n in names if n not in around.names]
-    evaluations = [(name, point, perturb(point)) for name in candidates for point in points(name)]
+    evaluations = [
+        (name, point, perturb(point))
+        for name in candidates
+        for point in (screened[name] if name in screened else points(name))
+    ]
     acting = {n: [perturb(point) for point in courses(n)] for n in (*CONSTANT, OPEN) if n in events}
     predicted = predictor.predict_all(np.stack(perturbed))[:, :, 0]
     # a point that the model cannot simulate changes nothing, so no evidence chooses it
@@ -216,9 +222,9 @@ def simulate(
     for name, point, k in evaluations:
         description, size = mechanism(name).description, point[strength_path(name)]
         at = [f"{name}.{p.name}" for p in description.parameters if p.change_point]
-        count = sum(candidate == name for candidate, _, _ in evaluations) * (
-            len(between) if at else 1
-        )
+        count = sum(candidate == name for candidate, _, _ in evaluations)
+        count *= len(between) if at else 1
+        count *= int(np.prod([len(p.grid) for p in description.parameters if p.screened]))
         low, high = sorted((description.strength.low / size, description.strength.high / size))
         term = Term(
             name,

@@ -60,6 +60,9 @@ class Parameter:
     #: True for a shape parameter whose default is a guess. Final estimates free it, so that the
     #: interval of the strength allows for it.
     uncertain: bool = False
+    #: True for a discrete parameter of a rule on commands whose grid is too fine to simulate: the
+    #: response to first order chooses of it.
+    screened: bool = False
     share: bool = False  #: True for a dimensionless share, which reports show in percent.
     #: True for the position in the recording, 0..1, from which on a change has set in. The
     #: likelihood is constant between two breaths: a fit tries all of them.

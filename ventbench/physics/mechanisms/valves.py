@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from ventbench.physics.mechanism import (
@@ -16,20 +17,24 @@ from ventbench.physics.mechanism import (
     View,
 )
 
+#: Steps of a valve, %: whole percents, and others so close to each other that the largest usual
+#: commands, of about 60 %, are off by a quarter of a step between two of them.
+_POSITIONS = tuple(np.exp(0.008 * np.arange(-87, 202)).tolist())
+
 
 class CommandRounding(Mechanism):
-    """Integer positions of the valve behind a logged fractional command."""
+    """A valve that moves in whole steps behind a logged fractional command."""
 
     description = Description(
         name="command_rounding",
-        title="command rounded to whole percents",
+        title="command rounded to whole steps",
         site="command",
-        equation="u_effective = u + amount (floor(u + bias) - u)",
+        equation="u_effective = u + amount (step floor(u / step + bias) - u)",
         parameters=(
             Parameter(
                 "amount",
                 "1",
-                "share of the rounding that is seen: 1 if the valve gets whole percents",
+                "share of the rounding that is seen: 1 if the valve gets whole steps",
                 0.0,
                 1.0,
                 0.0,
@@ -49,12 +54,26 @@ class CommandRounding(Mechanism):
                 grid=(0.0, 0.5),
                 discrete=True,
             ),
+            Parameter(
+                "step",
+                "%",
+                "distance of the positions; no derivative: a search compares all of its grid",
+                0.1,
+                10.0,
+                1.0,
+                1.0,
+                2.0,
+                "log",
+                shape=True,
+                grid=_POSITIONS,
+                discrete=True,
+                screened=True,
+            ),
         ),
-        source=(
-            "Valve drivers that take integers while the controller logs its fractional request."
-        ),
-        signature="Cut off, half a percent of the command is missing on average, which looks like "
-        "a dead band of 0.5 %; what remains follows the fraction of each command.",
+        source="Valve drivers that take integers, and stepping motors, while the controller logs "
+        "its fractional request; ISA-75.25: resolution of control valves.",
+        signature="Cut off, half a step of the command is missing on average, which looks like "
+        "a dead band; what remains follows the place of each command between two steps.",
         confusable=("valve_dead_band",),
         least=0.5,
         least_reason="a driver rounds or does not; half a rounding is another effect",
@@ -62,8 +81,9 @@ class CommandRounding(Mechanism):
     )
 
     def driven(self, values: Values, u_in: Array) -> Array:
-        """The command, moved towards a whole number."""
-        rounded = jnp.floor(u_in + values["bias"])
+        """The command, moved towards a whole step."""
+        step = values["step"]
+        rounded = step * jnp.floor(u_in / step + values["bias"])
         return u_in + values["amount"] * (rounded - u_in)
 
 

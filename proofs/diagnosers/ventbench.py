@@ -5,7 +5,7 @@ Its posterior is passed on, beside what held-out breaths accept of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,11 +120,29 @@ def hypotheses(
     if not named and not unknown and found["verdict"] == "unnamed":
         unknown = dict.fromkeys(places, 1.0 / len(places))
     for place, weight in (unknown or {"": 1.0}).items():
-        terms = named | {f"unknown:{place}"} if place else named
-        add(terms, (1.0 - shares.unsure) * shares.accepted * weight)
+        at = {f"unknown:{place}"} if place else set()
+        for names, probability in _swapped(named, found["mechanisms"]).items():
+            add(names | at, (1.0 - shares.unsure) * shares.accepted * weight * probability)
     kept = sorted(odds.items(), key=lambda pair: -pair[1])[:_MOST]
     total = sum(probability for _, probability in kept)
     return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept]
+
+
+def _swapped(
+    named: frozenset[str], mechanisms: Sequence[Mapping[str, Any]]
+) -> dict[frozenset[str], float]:
+    """Probabilities of the named set, and of those with a rival of one effect of some breaths.
+
+    Rivals of other names have their probability by the posterior of the search.
+    """
+    odds = {named: 1.0}
+    for missing in mechanisms:
+        name, confidence, others = (missing[k] for k in ("name", "confidence", "alternatives"))
+        for other in others if missing["affected_breaths"] else ():
+            swapped = named - {name} | {other}
+            odds[swapped] = odds.get(swapped, 0.0) + (1.0 / confidence - 1.0) / len(others)
+    total = sum(odds.values())
+    return {names: each / total for names, each in odds.items()}
 
 
 def _public(name: str) -> str:

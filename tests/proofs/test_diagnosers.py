@@ -84,10 +84,15 @@ def test_the_classifier_has_its_weights_and_sees_what_drifts() -> None:
         assert chances[k, at] > 10.0 * chances[0, at]
 
 
+def named(name: str, confidence: float = 1.0, *rivals: str, affected=None) -> dict[str, object]:
+    about = {"confidence": confidence, "alternatives": list(rivals), "affected_breaths": affected}
+    return {"name": name, **about}
+
+
 def told(verdict: str, *mechanisms: str, **found) -> dict[frozenset[str], float]:
     given = {
         "verdict": verdict,
-        "mechanisms": [{"name": name} for name in mechanisms],
+        "mechanisms": [named(name) for name in mechanisms],
         "slot": None,
         "changes": [],
         "saturated": None,
@@ -119,6 +124,20 @@ def test_the_posterior_is_passed_on_beside_what_held_out_breaths_accept() -> Non
     assert ratio == pytest.approx(3.0)
     changed = told("named", changes=[{"of": "gain", "drifts": False}], saturated={})
     assert changed[terms("gain_step", "saturation")] == pytest.approx(sure)
+
+
+def test_a_rival_of_an_effect_of_some_breaths_has_its_share() -> None:
+    share = (1.0 - CALIBRATION.unsure) * CALIBRATION.accepted
+    lost = named("lost_commands", 0.6, "late_commands", affected=[2, 5])
+    lag = named("valve_lag", 0.4, "valve_delay")
+    answer = told(
+        "named", "lost_commands", "valve_lag", posterior=[{"terms": [], "probability": 1}]
+    )
+    assert answer[terms("lost_commands", "valve_lag")] == pytest.approx(share)
+    answer = told("named", mechanisms=[lost, lag], posterior=[{"terms": [], "probability": 1}])
+    assert answer[terms("lost_commands", "valve_lag")] == pytest.approx(0.6 * share)
+    assert answer[terms("late_commands", "valve_lag")] == pytest.approx(0.4 * share)
+    assert terms("lost_commands", "valve_delay") not in answer  # its share is the posterior's
 
 
 def test_an_effect_without_a_name_is_at_its_places() -> None:

@@ -69,11 +69,12 @@ class Scored(NamedTuple):
     noise: Noise
     scatter: float  #: standard deviation of the logarithm of the breaths' gains.
     evidence: float  #: log evidence, nats.
+    label: float  #: log prior of the fitted R and C by their labels, nats.
 
-    @classmethod
-    def of(cls, model: LinearModel) -> Scored:
-        """From a linearised fit."""
-        return cls(model.fitted, model.terms, model.noise, model.scatter, model.evidence)
+    @property
+    def log_prior(self) -> float:
+        """Log prior of its names and of the lungs beside them, nats."""
+        return prior(names_of(self.terms)) + self.label
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +244,7 @@ def enumerate_sets(
 
 def _log_posterior(scored: Scored) -> float:
     """Log posterior of a set that was fitted, but for a constant, nats."""
-    return scored.evidence + prior(names_of(scored.terms), WARMTH)
+    return scored.evidence + prior(names_of(scored.terms), WARMTH) + scored.label
 
 
 def _marginalise(G: Floats, b: Floats, term: Term) -> tuple[float, Floats, Floats]:
@@ -305,7 +306,7 @@ class _Search:
         handled = {*self.excluded, *names_of(main.latent)}
         self.refused = [name for name in SWINGS if name not in handled]
         self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
-        self.scored[frozenset()] = Scored.of(self.linear_model(around, self.base, noise))
+        self.scored[frozenset()] = self.score(self.linear_model(around, self.base, noise))
         self.contenders.add(frozenset())
         self.rescore(around, noise)
         if also:
@@ -346,8 +347,8 @@ class _Search:
         for term in chosen.terms:
             rest = tuple(t for t in chosen.terms if t is not term)
             self.attempt(around, noise, rest, chosen.fitted, new=True)
-            if term.name in basis_terms():
-                self.name(term.name, rest, noise)
+            if term.name not in IN_TIME:
+                self.swap(term.name, rest, noise)
             if term.name in EVENTS and names_of(rest) in self.scored:
                 # The breaths in which it acts, beside the rest.
                 reduced = self.scored[names_of(rest)]
@@ -359,17 +360,22 @@ class _Search:
                 self.attempt(around, noise, (*rest, alternative), self.base, new=True)
         return around, noise
 
-    def name(self, unknown: str, rest: Set, noise: Noise) -> None:
-        """Fit the likeliest mechanisms in the place of a basis term that contains them."""
+    def swap(self, name: str, rest: Set, noise: Noise) -> None:
+        """Fit the likeliest others in the place of a term of a set.
+
+        In the place of a basis term, which contains them, these are its special cases.
+        """
         reduced = self.scored.get(names_of(rest))
         if reduced is None:
             return
         around = self.around(reduced.fitted)
         model = self.linear_model(around, reduced.fitted, noise, rest)
-        special = {
-            n for n in self.names if unknown in mechanism(n).description.special_case_of
-        } - names_of(rest)
-        terms = [t[0] for _, t in enumerate_sets(model, (), 1, 1) if t and t[0].name in special]
+        others = {
+            n
+            for n in self.names
+            if name not in basis_terms() or name in mechanism(n).description.special_case_of
+        } - {name, *names_of(rest)}
+        terms = [t[0] for _, t in enumerate_sets(model, (), 1, 1) if t and t[0].name in others]
         for term in terms[: self.settings.fits - 1]:
             self.attempt(around, noise, (*rest, term), reduced.fitted, new=True)
 
@@ -415,6 +421,11 @@ class _Search:
             for scatter in self.scatters
         )
         return max(models, key=lambda model: model.evidence)
+
+    def score(self, model: LinearModel) -> Scored:
+        """A set by its evidence, and by the labels of its lungs."""
+        label = self.evaluator.label_log_density(model.fitted)
+        return Scored(model.fitted, model.terms, model.noise, model.scatter, model.evidence, label)
 
     def fit(
         self,
@@ -500,19 +511,18 @@ class _Search:
                 return  # the model cannot simulate it
             model = self.linear_model(around, fitted, noise, terms)
             reduced = replace(self.data, measured=self.data.measured - model.in_time[:, None])
-        before = self.scored.get(names_of(terms))
-        if (
-            before is None
-            or self.linear_model(around, before.fitted, noise, terms).evidence < model.evidence
-        ):
-            self.scored[names_of(terms)] = Scored.of(model)
+        before, now = self.scored.get(names_of(terms)), self.score(model)
+        if before is not None:
+            before = self.score(self.linear_model(around, before.fitted, noise, terms))
+        if before is None or _log_posterior(before) < _log_posterior(now):
+            self.scored[names_of(terms)] = now
             self.contenders.add(names_of(terms))
 
     def rescore(self, around: CandidateEffects, noise: Noise) -> None:
         """Score all sets alike, but for those that are far behind."""
         for key in self.contenders:
             s = self.scored[key]
-            self.scored[key] = Scored.of(self.linear_model(around, s.fitted, noise, s.terms))
+            self.scored[key] = self.score(self.linear_model(around, s.fitted, noise, s.terms))
         most = max(self.scored[key].evidence for key in self.contenders)
         margin = self.settings.far_behind
         self.contenders = {
@@ -551,14 +561,13 @@ def weigh(
     scored: Sequence[Scored], linear: Sequence[tuple[float, Set]]
 ) -> dict[frozenset[str], float]:
     """Posterior of each set of names; the likeliest that was not fitted is a nat behind."""
-    logs = {names_of(s.terms): WARMTH * s.evidence for s in scored}
+    logs = {names_of(s.terms): WARMTH * s.evidence + s.log_prior for s in scored}
     at = {}
     for value, terms in linear:
         names = names_of(terms)
-        at[names] = WARMTH * (value - prior(names, WARMTH))
-    logs = {names: value + prior(names) for names, value in logs.items()}
-    offset = max(logs.values()) - 1.0 - max(value + prior(k) for k, value in at.items())
+        at[names] = WARMTH * (value - prior(names, WARMTH)) + prior(names)
+    offset = max(logs.values()) - 1.0 - max(at.values())
     for names, value in at.items():
-        logs.setdefault(names, value + prior(names) + offset)
+        logs.setdefault(names, value + offset)
     odds = np.exp(np.array(list(logs.values())) - max(logs.values()))
     return dict(zip(logs, (odds / odds.sum()).tolist(), strict=True))

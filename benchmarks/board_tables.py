@@ -14,6 +14,7 @@ from pathlib import Path
 import typer
 
 from ventbench.board import frames
+from ventbench.board.ranking import stressed_runs
 from ventbench.entries.runs import Runs
 
 ROOT = Path(__file__).parents[1]
@@ -23,7 +24,7 @@ def stressed() -> dict[str, Runs]:
     """Runs of the entries on the stress track, best first; none if their commands are not here."""
     tracks = frames.load_tracks(ROOT / "leaderboard", track="robustness")
     rows = next((track.stress for track in tracks if track.stress), ())
-    return {row.name: row.tables for row in rows}
+    return {row.record.name: stressed_runs(row) for row in rows}
 
 
 def stress_table(runs: dict[str, Runs]) -> str:

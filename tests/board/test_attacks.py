@@ -100,9 +100,9 @@ def test_an_attack_is_noticed(leaderboard: Path, simulators, attack: str) -> Non
 
 
 def test_a_withdrawal_without_a_key_changes_no_rank(leaderboard: Path) -> None:
-    before = [x.record.name for x in ranking.board(replay.load(leaderboard))[0].ranked]
+    before = [x.record.name for x in ranking.board(replay.load(leaderboard))[0].listed]
     withdrawn(leaderboard)
-    after = [x.record.name for x in ranking.board(replay.load(leaderboard))[0].ranked]
+    after = [x.record.name for x in ranking.board(replay.load(leaderboard))[0].listed]
     assert after == before != []
 
 

@@ -118,9 +118,8 @@ def test_tables_fit_80_columns(full: Path, monkeypatch: pytest.MonkeyPatch) -> N
     text = run("show", "--folder", full)
     assert max(map(len, text.splitlines())) <= 80
     for track in frames.load_tracks(full):
-        for status, row in track.rows:
-            if status == "ranked" and row.normalised is not None:
-                own = row.normalised.score
+        for row in track.rows:
+            if row.status == "ranked" and (own := row.normalised) is not None:
                 line = next(x for x in text.splitlines() if row.record.sha256[:8] in x)
                 assert row.record.name in line
                 assert f"{own.low:.1f} to {own.high:.1f}" in line

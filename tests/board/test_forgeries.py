@@ -84,6 +84,6 @@ def test_a_date_makes_nobody_an_author(leaderboard: Path, draft, simulators) -> 
     put(leaderboard, draft("honest", change=uneasy), simulators)
     accept(leaderboard)
     (track, _) = frames.load_tracks(leaderboard, track="performance")
-    rows = {row.record.name: row for row in track.ranked}
-    assert rows["honest"].entry.source == ""
-    assert rows["twin"].entry.source == "honest"
+    rows = {row.record.name: row for row in track.listed}
+    assert rows["honest"].source == ""
+    assert rows["twin"].source == "honest"

@@ -86,32 +86,32 @@ def test_tables_of_the_docs_are_those_of_the_records() -> None:
 
 def test_only_unseen_draws_of_a_round_count() -> None:
     board = ranking.board(replay.load(FOLDER))
-    tracks = [track for track in board if track.round is not None and track.ranked]
+    tracks = [track for track in board if track.round is not None and track.listed]
     assert len(tracks) >= 2
     for track in tracks:
-        rigs, names = track.ranked[0].record.figures, [row.record.name for row in track.ranked]
+        rigs, names = track.listed[0].record.figures, [row.record.name for row in track.listed]
         seen = np.flatnonzero(~rigs.ranked)
         assert 0 < len(seen) < rigs.ranked.size
         again = comparison.ranks(
             np.stack(
                 [
                     np.delete(r.record.figures.normalised[1:], seen, 0).mean(axis=2).T
-                    for r in track.ranked
+                    for r in track.listed
                 ]
             ),
             np.delete(rigs.rig, seen, 1),
-            [names.index(r.entry.source) if r.entry.source else None for r in track.ranked],
+            [names.index(r.source) if r.source else None for r in track.listed],
             matters=comparison.POINTS,
         )
-        assert again.rank.tolist() == [row.rank for row in track.ranked]
-        for row in track.ranked:
+        assert again.rank.tolist() == [row.place and row.place.rank for row in track.listed]
+        for row in track.listed:
             assert row.error is not None
             unseen = np.delete(row.record.figures.drawn, seen, 0)
             assert row.error.value == pytest.approx(unseen.mean(), abs=1e-12)
             assert row.error.low < row.error.value < row.error.high
             means = np.delete(row.record.figures.normalised[1:], seen, 0)
             assert row.normalised is not None
-            assert row.normalised.score.value == pytest.approx(means.mean(), abs=1e-9)
+            assert row.normalised.value == pytest.approx(means.mean(), abs=1e-9)
 
 
 def flat(values: dict[str, np.ndarray], at: tuple) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
+from ventbench.base.text import number
 from ventbench.board import (
     build,
     canonical,
@@ -22,6 +23,7 @@ from ventbench.board import (
     store,
     verify,
 )
+from ventbench.board.ranking import Place, stressed_runs
 from ventbench.board.replay import run_of
 from ventbench.entries import reference as references
 from ventbench.entries.runs import DRAWS, pip_columns
@@ -125,8 +127,8 @@ def test_stressed_commands_give_the_figures_again(board, drafts, simulators, own
     at = ranked, np.arange(6)[:, None], pip_columns(6, DRAWS)
     np.testing.assert_allclose(runs.error[0], figures.drawn[at], rtol=0, atol=1e-9)
     (track, _) = frames.load_tracks(board, track="robustness")
-    row = next(row for row in track.stress if row.name == "soft")
-    np.testing.assert_array_equal(row.tables.error, runs.error)
+    row = next(row for row in track.stress if row.record.name == "soft")
+    np.testing.assert_array_equal(stressed_runs(row).error, runs.error)
 
 
 def test_without_stressed_commands_there_is_no_stress_rank(board, drafts, simulators, tmp_path):
@@ -141,45 +143,47 @@ def test_without_stressed_commands_there_is_no_stress_rank(board, drafts, simula
     assert record.header.stress.commands.sha256 in note
     assert "are not at hand" in note
     (track, _) = frames.load_tracks(folder, track="robustness")
-    assert "soft" in [row.record.name for row in track.ranked]
-    assert "soft" not in [row.name for row in track.stress]
+    assert "soft" in [row.record.name for row in track.listed]
+    assert "soft" not in [row.record.name for row in track.stress]
 
 
 def test_ranks_follow_from_paired_tests(board):
     (track, _) = frames.load_tracks(board, track="robustness")
-    assert track.ranked[-1].record.name == "zero"
-    assert track.ranked[-1].ranks == (3, 3), "the PID and its copy count once"
-    rows = {row.record.name: row for row in track.ranked}
+    assert track.listed[-1].record.name == "zero"
+    assert track.listed[-1].place == Place(3, 3, 3), "the PID and its copy count once"
+    rows = {row.record.name: row for row in track.listed}
     own = rows["pid_robust"].normalised
     assert own is not None
-    assert own.score.value == pytest.approx(100.0, abs=0.5)
-    assert rows["uneven"].entry.source == "pid_robust", "its commands are nearly the PID's"
-    assert rows["soft"].entry.source == ""
+    assert own.value == pytest.approx(100.0, abs=0.5)
+    assert rows["uneven"].source == "pid_robust", "its commands are nearly the PID's"
+    assert rows["soft"].source == ""
 
 
 def test_stress_is_ranked_and_shown(board, built):
     (track, _) = frames.load_tracks(board, track="robustness")
     rows = track.stress
-    assert {row.name for row in rows} == {"soft", "uneven", "pid_robust"}
-    assert rows[0].rank == 1
-    scores = [row.tables.score for row in rows]
+    assert {row.record.name for row in rows} == {"soft", "uneven", "pid_robust"}
+    assert rows[0].stress_place is not None
+    assert rows[0].stress_place.rank == 1
+    scores = [stressed_runs(row).score for row in rows]
     assert scores == sorted(scores)
-    assert rows[0].score is not None
-    assert rows[0].score.value == pytest.approx(rows[0].tables.by_lung_and_draw.mean())
+    assert rows[0].stress is not None
+    whole = stressed_runs(rows[0]).by_lung_and_draw
+    assert rows[0].stress.value == pytest.approx(whole.mean())
     groups = pages.stress_chart(rows)
     fields = [field for group in groups for row in group["rows"] for field in row["fields"]]
     assert sum(field is not None for field in fields) == 3 * (len(conditions()) - 1)
     page = (built / "index.html").read_text()
     assert "Stressor by severity" in page
     for row in rows:
-        assert row.score is not None
-        own = (built / f"entries/{ROUND}/robustness/{row.name}.html").read_text()
-        assert f"{row.score.value:.2f}" in own
-        assert f"{row.score.value:.2f}" in page
+        assert row.stress is not None
+        own = (built / f"entries/{ROUND}/robustness/{row.record.name}.html").read_text()
+        assert f"{row.stress.value:.2f}" in own
+        assert f"{row.stress.value:.2f}" in page
     assert "Stressor" not in (built / f"entries/{ROUND}/robustness/zero.html").read_text()
     table = frames.load_board(board, track="robustness").set_index("name")
     assert table.stress_cmH2O["soft"] == pytest.approx(
-        next(row.tables.score for row in rows if row.name == "soft")
+        next(stressed_runs(row).score for row in rows if row.record.name == "soft")
     )
     assert np.isnan(table.stress_cmH2O["zero"])
 
@@ -187,14 +191,16 @@ def test_stress_is_ranked_and_shown(board, built):
 def test_an_entry_shows_what_it_fails_under(board, built):
     """By runs and cells alone: errors of a condition less those of the same cells without one."""
     track = next(x for x in frames.load_tracks(board) if x.stress)
-    row = next(row for row in track.stress if row.name == "soft")
-    error = row.tables.error
-    adds = {c.id: np.mean(error[k] - error[0]) for k, c in enumerate(row.tables.conditions) if k}
+    row = next(row for row in track.stress if row.record.name == "soft")
+    runs = stressed_runs(row)
+    adds = {
+        c.id: np.mean(runs.error[k] - runs.error[0]) for k, c in enumerate(runs.conditions) if k
+    }
     wanted = sorted(adds, key=adds.__getitem__, reverse=True)[: pages.WORST]
     shown = pages.stress_order(row)
     assert [line["title"] for line in shown] == [pages.title_of(name) for name in wanted]
-    assert [line["rise"] for line in shown] == [pages.signed(adds[name], 2) for name in wanted]
-    page = (built / pages.address(row.row.record)).read_text()
+    assert [line["rise"] for line in shown] == [number(adds[name], 2, sign=True) for name in wanted]
+    page = (built / pages.address(row.record)).read_text()
     assert shown[0]["small"] in page
     assert "Which physics it fails under" in page
 
@@ -217,7 +223,7 @@ def test_schema_names_what_is_wrong(drafts, change, message):
 
 def test_a_record_needs_all_stressors_or_none(board, simulators, score):
     (track, _) = frames.load_tracks(board, track="robustness")
-    whole = track.stress[0].tables
+    whole = stressed_runs(track.stress[0])
     few = dataclasses.replace(whole, conditions=whole.conditions[:5], error=whole.error[:5])
     with pytest.raises(InputError, match="all stressors on 6 draws, or none"):
         create.create(dataclasses.replace(score, stressed=few), simulators)
@@ -337,9 +343,9 @@ def test_accepting_is_what_ranks(board, tmp_path):
     folder = shutil.copytree(board, tmp_path / "leaderboard")
     for path in (folder / canonical.ATTESTATIONS, *folder.rglob("*.sig")):
         path.unlink()
-    assert not frames.load_tracks(folder)[1].ranked
+    assert not frames.load_tracks(folder)[1].listed
     accept(folder)
-    assert len(frames.load_tracks(folder)[1].ranked) == 4
+    assert len(frames.load_tracks(folder)[1].listed) == 4
 
 
 def test_clusters_of_stress_are_the_rigs_that_ran(board, monkeypatch):
@@ -351,7 +357,7 @@ def test_clusters_of_stress_are_the_rigs_that_ran(board, monkeypatch):
 
     monkeypatch.setattr(comparison, "ranks", spied)
     track = next(x for x in frames.load_tracks(board) if x.stress)
-    tables, own = track.stress[0].tables, track.stress[0].row.record.figures
+    tables, own = stressed_runs(track.stress[0]), track.stress[0].record.figures
     np.testing.assert_array_equal(tables.rig, own.rig[:, own.ranked][:, :DRAWS])
     assert sum(np.array_equal(rig, tables.rig) for rig in used) == 1
 

@@ -58,9 +58,9 @@ def test_an_entry_is_replaced_once_it_is_withdrawn(leaderboard: Path, draft, sim
         put(leaderboard, made, simulators)
     accept(leaderboard)
     new = put(leaderboard, made, simulators)
-    entry = next(x for x in performance(leaderboard).ranked if x.record.name == "softer")
+    entry = next(x for x in performance(leaderboard).listed if x.record.name == "softer")
     assert entry.record.sha256 == new.sha256
-    assert {record.sha256 for record in entry.entry.history} == {new.sha256, old.sha256}
+    assert {record.sha256 for record in entry.history} == {new.sha256, old.sha256}
     assert verify(leaderboard, lambda: simulators).problems == []
     with pytest.raises(InputError, match=f"the entry has record {new.sha256[:12]}; withdraw that"):
         put(leaderboard, draft("softer", factor=0.94), simulators)
@@ -82,12 +82,13 @@ def test_verify_reports_a_replacement_that_add_refuses(
 def test_a_withdrawn_record_is_listed_with_its_reason(leaderboard: Path) -> None:
     old = next(x for x in store.load(leaderboard).scores if x.name == "softer")
     store.withdraw(leaderboard, old.sha256[:10], "its <b>authors</b> found a bug")
-    assert "softer" in [x.record.name for x in performance(leaderboard).ranked], "unsigned"
+    assert "softer" in [x.record.name for x in performance(leaderboard).listed], "unsigned"
     accept(leaderboard)
     track = performance(leaderboard)
-    assert "softer" not in [x.record.name for x in track.ranked]
-    (entry,) = [x for x in track.unranked if x.record.name == "softer"]
-    assert entry.entry.reasons == ("withdrawn: its <b>authors</b> found a bug",)
+    assert "softer" not in [x.record.name for x in track.listed]
+    (entry,) = [x for x in track.rows if x.record.name == "softer"]
+    assert entry.status == "not ranked"
+    assert entry.reasons == ("withdrawn: its <b>authors</b> found a bug",)
     with pytest.raises(InputError, match="already"):
         store.withdraw(leaderboard, old.sha256, "again")
     with pytest.raises(InputError, match="no single record"):

@@ -153,7 +153,7 @@ def test_two_rounds_with_outsiders_refused_and_returning_entries(
     assert "unfinished" in failed[0]["two (performance)"]
     assert "No such file" in failed[1]["lacking (performance)"]
     ranked = {
-        track.draws: {row.record.name: row.rank for row in track.ranked}
+        track.draws: {row.record.name: row.place and row.place.rank for row in track.listed}
         for track in frames.load_tracks(board, track="performance")
         if track.round
     }

@@ -17,7 +17,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.text import flatten
 from ventbench.board import canonical, frames, pages, ranking, replay
 from ventbench.board.figures import Figures
-from ventbench.board.frames import Column, Line
+from ventbench.board.frames import Column
 from ventbench.board.gate import Evidence
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
@@ -99,11 +99,10 @@ def _index(
     round_: Round | None = None,
 ) -> str:
     """Return the page of the board, or that of a round; ``root`` leads to the page of the board."""
-    lines = frames.lines(tracks)
-    columns = _telling(lines)
-    first = lines[0].row.record.figures if lines else None
+    entries = frames.entries(tracks)
+    columns = _telling(entries)
+    first = entries[0].record if entries else None
     page_round = round_ or next((track.round for track in tracks if track.round), None)
-    header = lines[0].row.record.header if lines else None
     # Under missing physics, practice is shown only where nothing is ranked.
     of_first = [track for track in tracks if track.draws == tracks[0].draws] if tracks else []
     stressed = [row for track in of_first for row in track.stress]
@@ -111,11 +110,10 @@ def _index(
         tracks=[_track(track, columns) for track in tracks],
         columns=columns,
         titles=[column.title for column in columns],
-        ranking=first and {"ranked": int(first.ranked.sum()), "drawn": first.ranked.size},
+        first=first,
         measured=any(track.hardware for track in tracks),
-        aside=[_aside(line) for line in lines if line.status not in ("ranked", "practice")],
-        simulators=flatten(header.simulators) if header else [],
-        draws=header.draws if header else None,
+        aside=[_aside(row) for row in entries if not row.listed],
+        simulators=flatten(first.header.simulators) if first else [],
         stress=[pages.stress_context(row) for row in stressed],
         chart=pages.stress_chart(stressed),
         records=len(leaderboard.records),
@@ -131,24 +129,24 @@ def _index(
     )
 
 
-def _telling(lines: Sequence[Line]) -> list[Column]:
+def _telling(entries: Sequence[Row]) -> list[Column]:
     """Columns of the page that do not say the same of every entry that is shown in its tables."""
-    listed = [line for line in lines if line.status in ("ranked", "practice")]
+    listed = [row for row in entries if row.listed]
     return [
         column
         for column in PAGE_COLUMNS
         if len(listed) < 2
-        or (cells := [column.cell(line) for line in listed]).count(cells[0]) < len(cells)
+        or (cells := [column.cell(row) for row in listed]).count(cells[0]) < len(cells)
     ]
 
 
 def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
     rows = []
-    for row in track.ranked:
+    for row in track.listed:
         measured = pages.hardware_of(track.hardware, row.record.name)
         rows.append(
             {
-                "cells": [column.cell(Line(track, "ranked", row)) for column in columns],
+                "cells": [column.cell(row) for column in columns],
                 "path": pages.address(row.record),
                 "baseline": row.record.name == BASELINES[track.name],
                 "hardware": None if measured is None else pages.hardware_context(measured),
@@ -164,14 +162,14 @@ def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
     }
 
 
-def _aside(line: Line) -> dict[str, Any]:
+def _aside(row: Row) -> dict[str, Any]:
     """A line of the list of entries that are not ranked."""
     return {
-        "name": line.row.record.name,
-        "track": line.track.name,
-        "path": pages.address(line.row.record),
-        "score": pages.figure(line.row.error.value) if line.row.error else pages.NONE,
-        "reasons": list(line.row.entry.reasons),
+        "name": row.record.name,
+        "track": row.record.track,
+        "path": pages.address(row.record),
+        "score": pages.figure(row.error.value) if row.error else pages.NONE,
+        "reasons": row.reasons,
     }
 
 
@@ -180,21 +178,23 @@ def _entry_pages(
 ) -> dict[str, bytes]:
     """Return the pages of all entries of a track by their paths."""
     template = environment.get_template("entry.html.j2")
-    base = track.baseline
-    baseline_paths = None if base is None else pages.paths(base)
+    base = ranking.baseline(track.listed)
+    baseline_paths = None if base is None else pages.paths(base.record)
     rendered: dict[str, bytes] = {}
-    for status, row in track.rows:
+    for row in track.rows:
         name = row.record.name
         path = pages.address(row.record)
-        same = base is not None and row.record.sha256 == base.sha256
-        values = _values(Line(track, status, row), None if same else base, evidence)
-        panels = pages.panels(pages.paths(row.record), None if same else baseline_paths)
+        compared = None if row is base else base
+        values = _values(row, evidence)
+        values["compared"] = compared and compared.record.name
+        values["count"] = len(track.listed)
+        panels = pages.panels(pages.paths(row.record), compared and baseline_paths)
         values["panels"] = [[pages.trusted(panel) for panel in lung] for lung in panels]
         measured = (
             hardware_row for hardware_row in track.hardware if hardware_row.record.name == name
         )
         values["hardware"] = [pages.hardware_context(hardware_row) for hardware_row in measured]
-        stressed = [stress_row for stress_row in track.stress if stress_row.name == name]
+        stressed = [row] if row in track.stress else []
         values["stress"] = pages.stress_context(stressed[0]) if stressed else None
         values["worst"] = pages.stress_order(stressed[0]) if stressed else []
         values["chart"] = pages.stress_chart(stressed)
@@ -203,18 +203,13 @@ def _entry_pages(
     return rendered
 
 
-def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, Any]:
-    track, status, row = line
+def _values(row: Row, evidence: Evidence) -> dict[str, Any]:
     record, header, figures = row.record, row.record.header, row.record.figures
-    cells = {column.names[0]: column.cell(line) for column in PAGE_COLUMNS}
+    cells = {column.names[0]: column.cell(row) for column in PAGE_COLUMNS}
     return {
         "record": record,
-        "content": header,
-        "manifest": record.manifest,
-        "status": status,
-        "reasons": row.entry.reasons,
-        "track": track.name,
-        "count": len(track.ranked),
+        "status": row.status,
+        "reasons": row.reasons,
         "counted": int(figures.ranked.sum()),
         "runs": figures.error.size,
         "cells": cells,
@@ -224,7 +219,6 @@ def _values(line: Line, base: Record | None, evidence: Evidence) -> dict[str, An
             if column.names[0] not in ("rank", "name", "normalised")
         ],
         "scaled": pages.heat_map(_ranking(figures, figures.normalised), pages.NORMALISED_LIMITS, 0),
-        "compared": base.name if base else None,
         "heat": pages.heat_map(_ranking(figures, figures.error), pages.ERROR_LIMITS),
         "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
@@ -279,7 +273,7 @@ def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]
 def _history(row: Row, evidence: Evidence) -> list[dict[str, Any]]:
     """All records of the entry, newest first, and what became of each."""
     lines = []
-    for record in row.entry.history:
+    for record in row.history:
         withdrawn = evidence.withdrawn.get(record.sha256)
         state = "counts" if record.sha256 == row.record.sha256 else "does not count"
         lines.append(

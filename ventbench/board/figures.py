@@ -11,8 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
+from ventbench.base.interval import Interval
 from ventbench.entries.runs import Runs
 from ventbench.task import draws, protocol
+from ventbench.task.metrics import bootstrap
 from ventbench.task.metrics.score import normalised
 
 
@@ -64,6 +66,17 @@ class Figures:
     def ranked_values(self) -> Floats:
         """What ranks: mean normalised score of each lung and ranked draw, ``(L, k)``."""
         return self.normalised[1:][self.ranked].mean(axis=2).T
+
+    def interval(self, values: Floats) -> Interval | None:
+        """Mean of values of each lung and ranked draw, ``(L, k)``, with its 95 % interval.
+
+        Resampled alike for all records of the same draws; None if a drawn run failed.
+        """
+        if not np.isfinite(self.drawn).all():
+            return None
+        rig, member = self.rig[:, self.ranked], self.member[:, self.ranked]
+        resampled = bootstrap.resampled_scores(values, rig, member)
+        return Interval(float(np.mean(values)), *bootstrap.limits(resampled))
 
     @property
     def training_values(self) -> Floats:

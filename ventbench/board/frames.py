@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -25,14 +25,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-class Line(NamedTuple):
-    """One entry of the board: its track, its status, its row."""
-
-    track: Track
-    status: str
-    row: Row
-
-
 @dataclass(frozen=True)
 class Column:
     """One figure of an entry, wherever the board is shown."""
@@ -40,7 +32,7 @@ class Column:
     #: of its columns in the CSV and in frames: one, or value, low and high end.
     names: tuple[str, ...]
     #: of an entry: text, a number, None, or an :class:`~ventbench.base.interval.Interval`.
-    value: Callable[[Line], Any]
+    value: Callable[[Row], Any]
     description: str  #: what it is, with its unit; on the page as the hint of its heading.
     title: str = ""  #: heading on the page; empty where the page does not show it.
     digits: int = 3  #: that page and terminal show.
@@ -48,29 +40,29 @@ class Column:
     sign: bool = False
     unit: str = ""  #: that follows the number on the page.
     #: below the number on the page, where it is no interval.
-    small: Callable[[Line], str] = lambda line: ""
+    small: Callable[[Row], str] = lambda line: ""
     #: headings of the number, and of what is below it, in the terminal.
     terminal: tuple[str, ...] = ()
 
-    def cell(self, line: Line) -> dict[str, Any]:
+    def cell(self, row: Row) -> dict[str, Any]:
         """Text, small text, value to sort by, and kind, for page and terminal."""
-        value = self.value(line)
+        value = self.value(row)
         if value is None or isinstance(value, Interval):
             return pages.interval(value, self.digits, sign=self.sign)
         if not isinstance(value, float):
-            return {"text": str(value), "small": self.small(line), "value": value, "kind": ""}
+            return {"text": str(value), "small": self.small(row), "value": value, "kind": ""}
         exists = math.isfinite(value)
         text = f"{pages.figure(value, self.digits)}{self.unit if exists else ''}"
         return {
             "text": text,
-            "small": self.small(line),
+            "small": self.small(row),
             "value": f"{value:.9g}" if exists else "",
             "kind": "",
         }
 
-    def values(self, line: Line) -> tuple[Any, ...]:
+    def values(self, row: Row) -> tuple[Any, ...]:
         """Values by :attr:`names`; NaN or None where there is none."""
-        value = self.value(line)
+        value = self.value(row)
         if len(self.names) == 1:
             return (value,)
         if value is None:
@@ -83,52 +75,23 @@ def _of_three(name: str, stem: str = "") -> tuple[str, str, str]:
     return name, f"{stem}_low", f"{stem}_high"
 
 
-def _ranks(line: Line) -> str:
-    """Ranks that it may have, where they are several."""
-    low, high = line.row.ranks or (0, 0)
-    return f"{low} to {high}" if low < high else ""
+def _family(row: Row) -> str:
+    source = f", commands as of {row.source}" if row.source else ""
+    return f"{row.record.manifest.family}{source}"
 
 
-def _family(line: Line) -> str:
-    source = line.row.entry.source
-    return f"{line.row.record.manifest.family}{f', commands as of {source}' if source else ''}"
-
-
-def _compared(name: str) -> Callable[[Line], Interval | None]:
-    """A field of the comparison of normalised scores."""
-    return lambda line: None if line.row.normalised is None else getattr(line.row.normalised, name)
-
-
-def _held_out_gap(line: Line) -> float:
+def _held_out_gap(row: Row) -> float:
     """NaN in practice, where draws are on all rigs."""
-    figures = line.row.record.figures
+    figures = row.record.figures
     training = figures.training_values
     return float(figures.ranked_values.mean() - training.mean()) if training.size else math.nan
 
 
-def _seeds(line: Line) -> Interval | None:
-    """Of the entry that the round scored, if its folder holds seeds."""
-    result, key = line.track.round and line.track.round.result, line.row.record.name
-    key += f" ({line.track.name})"
-    if not result or result.records.get(key) != line.row.record.sha256 or key not in result.seeds:
-        return None
-    return comparison.over_seeds(result.seeds[key])
-
-
-def _stress(line: Line) -> Interval | None:
-    stressed = line.row.record.figures.stressed
-    return (
-        None
-        if stressed is None
-        else Interval(stressed.score, *stressed.interval(stressed.by_lung_and_draw))
-    )
-
-
-def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callable[[Line], Any]:
+def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callable[[Row], Any]:
     """A figure of the stressed runs; ``missing`` where there are none."""
 
-    def value(line: Line) -> Any:
-        stressed = line.row.record.figures.stressed
+    def value(row: Row) -> Any:
+        stressed = row.record.figures.stressed
         return missing if stressed is None else figure(stressed)
 
     return value
@@ -136,30 +99,30 @@ def _of_stress(figure: Callable[[Any], Any], missing: Any = math.nan) -> Callabl
 
 #: Every figure of an entry, in the order of pages and CSV.
 COLUMNS = (
-    Column(("track",), lambda x: x.track.name, "performance or robustness"),
+    Column(("track",), lambda x: x.record.track, "performance or robustness"),
     Column(("status",), lambda x: x.status, "ranked, practice, not ranked or not official"),
     Column(
         ("rank",),
-        lambda x: x.row.rank,
+        lambda x: x.place and x.place.rank,
         "Rank, and the ranks that it may have",
         title="Rank",
-        small=_ranks,
+        small=lambda x: x.place.range if x.place else "",
         terminal=("rank", "ranks"),
     ),
-    Column(("rank_low",), lambda x: x.row.ranks and x.row.ranks[0], "best rank that it may have"),
-    Column(("rank_high",), lambda x: x.row.ranks and x.row.ranks[1], "worst rank"),
+    Column(("rank_low",), lambda x: x.place and x.place.best, "best rank that it may have"),
+    Column(("rank_high",), lambda x: x.place and x.place.worst, "worst rank"),
     Column(
         ("name",),
-        lambda x: x.row.record.name,
+        lambda x: x.record.name,
         "Name and family of the controller",
         title="Entry",
         small=_family,
         terminal=("entry",),
     ),
-    Column(("family",), lambda x: x.row.record.manifest.family, "family of the controller"),
+    Column(("family",), lambda x: x.record.manifest.family, "family of the controller"),
     Column(
         _of_three("normalised"),
-        _compared("score"),
+        lambda x: x.normalised,
         "0 = best attainable, 100 = best PID of the lung; mean over the draws that rank",
         title="Normalised",
         digits=1,
@@ -167,7 +130,7 @@ COLUMNS = (
     ),
     Column(
         _of_three("normalised_to_pid"),
-        _compared("to_baseline"),
+        lambda x: x.to_baseline,
         "Difference of the normalised score to the track's baseline, pid_best or pid_robust",
         title="To the baseline",
         digits=1,
@@ -175,7 +138,7 @@ COLUMNS = (
     ),
     Column(
         _of_three("normalised_to_above"),
-        _compared("to_above"),
+        lambda x: x.to_above,
         "Normalised score minus that of the entry above it",
         title="To the entry above",
         digits=1,
@@ -183,26 +146,26 @@ COLUMNS = (
     ),
     Column(
         _of_three("score_cmH2O", "score"),
-        lambda x: x.row.error,
+        lambda x: x.error,
         "The paper's figure: mean |pressure − target| over the draws that rank, cmH₂O",
         title="Error",
         terminal=("error",),
     ),
     Column(
         ("nominal_cmH2O",),
-        lambda x: x.row.nominal,
+        lambda x: float(x.record.figures.nominal.mean()),
         "error without noise and deviations on the reference rigs, as in the paper, cmH2O",
     ),
     Column(
         ("worst_cmH2O",),
-        lambda x: x.row.worst[0],
+        lambda x: x.worst[0],
         "highest mean of one lung and PIP over all draws, cmH2O",
     ),
-    Column(("worst_lung",), lambda x: x.row.worst[1], "lung of the worst cell"),
-    Column(("worst_pip",), lambda x: x.row.worst[2], "PIP of the worst cell, cmH₂O"),
+    Column(("worst_lung",), lambda x: x.worst[1], "lung of the worst cell"),
+    Column(("worst_pip",), lambda x: x.worst[2], "PIP of the worst cell, cmH₂O"),
     Column(
         ("exploitation_cmH2O",),
-        lambda x: x.row.record.figures.exploitation,
+        lambda x: x.record.figures.exploitation,
         "how far the ensemble of simulators disagrees on this entry's pressures, cmH2O",
     ),
     Column(
@@ -215,25 +178,25 @@ COLUMNS = (
     ),
     Column(
         _of_three("seeds"),
-        _seeds,
+        lambda x: comparison.over_seeds(x.seeds) if x.seeds else None,
         "Interquartile mean of the normalised score over seeds of the training",
         title="Seeds",
         digits=1,
     ),
     Column(
         ("derived_from",),
-        lambda x: x.row.entry.source,
+        lambda x: x.source,
         "earlier entry whose commands it follows nearly everywhere",
     ),
     Column(
         ("act_median_us",),
-        lambda x: pages.step_time(x.row.record.header.timing),
+        lambda x: pages.step_time(x.record.header.timing),
         "Median time of one step of the controller, µs",
         title="Step",
         digits=0,
         unit=" µs",
     ),
-    Column(_of_three("stress_cmH2O", "stress"), _stress, "stress score, cmH₂O"),
+    Column(_of_three("stress_cmH2O", "stress"), lambda x: x.stress, "stress score, cmH₂O"),
     Column(
         ("stress_rise_cmH2O",),
         _of_stress(lambda t: t.score - t.unstressed),
@@ -249,17 +212,17 @@ COLUMNS = (
         _of_stress(lambda t: int((~t.safe[1:]).sum()), None),
         "stressed runs with unsafe pressure",
     ),
-    Column(("failed_cells",), lambda x: len(x.row.record.header.failures), "cells that failed"),
+    Column(("failed_cells",), lambda x: len(x.record.header.failures), "cells that failed"),
     Column(
-        ("safe",), lambda x: bool(x.row.record.figures.safe.all()), "all lungs pass the safety gate"
+        ("safe",), lambda x: bool(x.record.figures.safe.all()), "all lungs pass the safety gate"
     ),
-    Column(("reasons",), lambda x: plain("; ".join(x.row.entry.reasons)), "why it is not ranked"),
-    Column(("created",), lambda x: x.row.record.header.created, "when it was scored, UTC"),
-    Column(("draws",), lambda x: x.row.record.header.draws.season, "name of the draws"),
-    Column(("record",), lambda x: x.row.record.sha256, "SHA-256 of the record"),
+    Column(("reasons",), lambda x: plain("; ".join(x.reasons)), "why it is not ranked"),
+    Column(("created",), lambda x: x.record.header.created, "when it was scored, UTC"),
+    Column(("draws",), lambda x: x.record.header.draws.season, "name of the draws"),
+    Column(("record",), lambda x: x.record.sha256, "SHA-256 of the record"),
     Column(
         ("submission",),
-        lambda x: x.row.record.header.submission.sha256,
+        lambda x: x.record.header.submission.sha256,
         "SHA-256 of the submission's files",
     ),
 )
@@ -303,7 +266,7 @@ def load_board(folder: Path | str | None = None, *, track: str | None = None) ->
     import pandas as pd
 
     tracks = load_tracks(folder, track=track)
-    frame = pd.DataFrame([_values(line) | _by_lung(line.row.record) for line in lines(tracks)])
+    frame = pd.DataFrame([_values(row) | _by_lung(row.record) for row in entries(tracks)])
     return frame.astype({name: "Int64" for name in _NULLABLE_INTEGERS})
 
 
@@ -319,26 +282,21 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
     import pandas as pd
 
     parts = []
-    for tracks in load_tracks(folder, track=track):
-        for _, row in tracks.rows:
-            record = row.record
-            errors = record.figures.error
-            draw, lung, pip = np.indices(errors.shape).reshape(3, -1)
-            parts.append(
-                pd.DataFrame(
-                    {
-                        "track": tracks.name,
-                        "draws": record.header.draws.season,
-                        "name": record.name,
-                        "lung": np.array(LUNG_IDS)[lung],
-                        "pip": np.array(protocol.PIPS)[pip],
-                        "draw": draw,
-                        "error_cmH2O": errors.ravel(),
-                        "peak_cmH2O": record.figures.peak.ravel(),
-                        "steps_above": record.figures.steps_above.ravel(),
-                    }
-                ),
-            )
+    for record in (row.record for row in entries(load_tracks(folder, track=track))):
+        figures = record.figures
+        draw, lung, pip = np.indices(figures.error.shape).reshape(3, -1)
+        columns = {
+            "track": record.track,
+            "draws": record.header.draws.season,
+            "name": record.name,
+            "lung": np.array(LUNG_IDS)[lung],
+            "pip": np.array(protocol.PIPS)[pip],
+            "draw": draw,
+            "error_cmH2O": figures.error.ravel(),
+            "peak_cmH2O": figures.peak.ravel(),
+            "steps_above": figures.steps_above.ravel(),
+        }
+        parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -358,9 +316,9 @@ def folder_of(folder: Path | str | None) -> Path:
     return files.leaderboard_folder() if path == FOLDER and not path.is_dir() else path
 
 
-def lines(tracks: Sequence[Track]) -> list[Line]:
+def entries(tracks: Sequence[Track]) -> list[Row]:
     """All entries of some tracks, in the order in which they are shown."""
-    return [Line(track, *row) for track in tracks for row in track.rows]
+    return [row for track in tracks for row in track.rows]
 
 
 def csv_text(tracks: Sequence[Track]) -> str:
@@ -368,30 +326,32 @@ def csv_text(tracks: Sequence[Track]) -> str:
     output = io.StringIO()
     writer = csv.writer(output, lineterminator="\n")
     writer.writerow(name for column in COLUMNS for name in column.names)
-    writer.writerows(csv_row(line).values() for line in lines(tracks))
+    writer.writerows(csv_row(row).values() for row in entries(tracks))
     return output.getvalue()
 
 
 def markdown(tracks: Sequence[Track]) -> str:
     """The newest ranked entries as a table of Markdown, a line for each, by the first track."""
     blank = {"performance": [""] * 3, "robustness": [""] * 4}
-    listed = [line for line in lines(tracks) if line.status in ("ranked", "practice")]
+    listed = [row for row in entries(tracks) if row.listed]
     cells: dict[str, dict[str, list[str]]] = {}
-    for line in (x for x in listed if x.track.draws == listed[0].track.draws):
-        track, status, row = line
-        ranks = f"{row.rank}" if status == "ranked" else status
-        if several := _ranks(line):
-            ranks += f" ({several})"
-        stress, score = _stress(line), row.normalised and row.normalised.score
-        if track.name == "performance":
-            secondary = [f"{row.error.value:.3f}" if row.error else ""]
-        elif stress:
-            survived = _of_stress(lambda t: t.survived_share)(line)
-            secondary = [f"{stress.value:.2f}", f"{100 * survived:.0f} %"]
-        else:
-            secondary = ["", ""]
+    for row in listed:
+        record, score = row.record, row.normalised
+        if record.header.draws.season != listed[0].record.header.draws.season:
+            continue
+        rank = str(row.place.rank) if row.place else row.status
+        if row.place and row.place.range:
+            rank += f" ({row.place.range})"
         text = f"**{score.value:.1f}** [{score.low:.1f}, {score.high:.1f}]" if score else ""
-        cells.setdefault(row.record.name, {})[track.name] = [text, ranks, *secondary]
+        if record.track == "performance":
+            secondary = [f"{row.error.value:.3f}" if row.error else ""]
+        else:
+            stressed = record.figures.stressed
+            secondary = [
+                f"{row.stress.value:.2f}" if row.stress else "",
+                f"{100 * stressed.survived_share:.0f} %" if stressed else "",
+            ]
+        cells.setdefault(record.name, {})[record.track] = [text, rank, *secondary]
     titles = ["entry", "performance", "rank", "error"]
     titles += ["robustness", "rank", "stress", "runs survived"]
     table = [titles, ["---"] * len(titles)]
@@ -399,14 +359,14 @@ def markdown(tracks: Sequence[Track]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in table)
 
 
-def csv_row(line: Line) -> dict[str, Any]:
+def csv_row(row: Row) -> dict[str, Any]:
     """One line of the CSV by column: text, or a whole number."""
-    return {key: _csv_cell(key, value) for key, value in _values(line).items()}
+    return {key: _csv_cell(key, value) for key, value in _values(row).items()}
 
 
-def _values(line: Line) -> dict[str, Any]:
+def _values(row: Row) -> dict[str, Any]:
     """Values of an entry by column; None or NaN where there is none."""
-    pairs = (zip(column.names, column.values(line), strict=True) for column in COLUMNS)
+    pairs = (zip(column.names, column.values(row), strict=True) for column in COLUMNS)
     return {name: value for pair in pairs for name, value in pair}
 
 

@@ -73,7 +73,7 @@ class Evidence:
 
 
 def simulated(record: Record, evidence: Evidence) -> tuple[str, ...]:
-    """Why a record has no rank on its track; empty if it has one."""
+    """Why a record has no rank on its track, nor under missing physics; empty if it has one."""
     why = list(unfit(record, evidence))
     if not record.official:
         why.insert(0, "not official: its sandbox lacked a layer, or there was none")
@@ -101,13 +101,6 @@ def unfit(record: Record, evidence: Evidence) -> tuple[str, ...]:
         cut = first if len(first) <= MAX_QUOTED else f"{first[:MAX_QUOTED]}…"
         why.append(f"{failed} of {cells} cells failed, the first: {cut}")
     return (*why, *_unsafe(LUNG_IDS, record.figures.safe))
-
-
-def stressed(record: Record, evidence: Evidence) -> tuple[str, ...]:
-    """Why a record has no rank under missing physics; empty if it has one."""
-    if record.figures.stressed is None:
-        return ("it did not run under missing physics, or its commands there are not at hand",)
-    return simulated(record, evidence)
 
 
 def measured(record: HardwareRecord, evidence: Evidence) -> tuple[str, ...]:

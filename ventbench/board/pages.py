@@ -26,7 +26,7 @@ from ventbench import palette
 from ventbench.base.arrays import Floats
 from ventbench.base.interval import Interval
 from ventbench.base.text import number, page_templates, plain
-from ventbench.board.ranking import HardwareRow, StressRow
+from ventbench.board.ranking import HardwareRow, Row, stressed_runs
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
@@ -163,55 +163,59 @@ def hardware_context(row: HardwareRow) -> dict[str, Any]:
     }
 
 
-def stress_context(row: StressRow) -> dict[str, Any]:
+def stress_context(row: Row) -> dict[str, Any]:
     """A row of the stress track for the templates."""
-    figures = row.tables.headline()
+    runs = stressed_runs(row)
+    figures = runs.headline()
     return {
-        "name": row.name,
-        "rank": row.rank,
-        "ranks": row.ranks,
-        "path": address(row.row.record),
-        "family": row.row.record.manifest.family,
-        "score": None if row.score is None else interval(row.score, 2),
-        "unstressed": figure(row.tables.unstressed, 2),
+        "name": row.record.name,
+        "place": row.stress_place,
+        "path": address(row.record),
+        "family": row.record.manifest.family,
+        "score": None if row.stress is None else interval(row.stress, 2),
+        "unstressed": number(figures["unstressed"], 2),
         "unstressed_survived": f"{100 * figures['survived_unstressed']:.0f}",
-        "rise": signed(_float(figures["rise"]), 2),
+        "rise": number(figures["rise"], 2, sign=True),
         "rise_value": "" if figures["rise"] is None else f"{figures['rise']:.6f}",
         "survived": f"{100 * figures['survived']:.1f}",
         "unsafe": figures["unsafe_runs"],
         "runs": figures["stressed_runs"],
-        "alarm": figure(float(np.mean(row.tables.alarm_s[1:])), 2),
-        "worst": figure(_float(figures["worst_error"]), 1),
+        "alarm": number(figures["above_alarm_s"], 2),
+        "worst": number(figures["worst_error"], 1),
         "worst_where": title_of(figures["worst_condition"]),
     }
 
 
-def stress_order(row: StressRow) -> list[dict[str, str]]:
+def stress_order(row: Row) -> list[dict[str, str]]:
     """Conditions by what they add to the error of the same cells without a stressor, most first.
 
     Each has a ``title``, the ``rise`` with its 95 % interval ``small``, cmH2O, and the share of the
     runs that it leaves, ``survived``, %. A condition in which a run failed comes first.
     """
-    by_condition = row.tables.by_condition[1:]
+    by_condition = stressed_runs(row).by_condition[1:]
 
     def rise(figures: dict[str, Any]) -> float:
         return math.inf if figures["rise_cmH2O"] is None else figures["rise_cmH2O"]
 
     lines = []
     for figures in sorted(by_condition, key=rise, reverse=True)[:WORST]:
-        low, high = (_float(limit) for limit in figures["rise_ci95"])
+        low, high = figures["rise_ci95"]
         lines.append(
             {
                 "title": title_of(figures["condition"]),
-                "rise": signed(_float(figures["rise_cmH2O"]), 2),
-                "small": f"{signed(low, 2)} to {signed(high, 2)}" if math.isfinite(low) else "",
+                "rise": number(figures["rise_cmH2O"], 2, sign=True),
+                "small": (
+                    f"{number(low, 2, sign=True)} to {number(high, 2, sign=True)}"
+                    if low is not None
+                    else ""
+                ),
                 "survived": f"{100 * figures['survived']:.0f}",
             }
         )
     return lines
 
 
-def stress_chart(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
+def stress_chart(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Stressor by severity: groups of rows, with fields of entries under the same conditions.
 
     A group a category with ``title`` and ``rows``; a row has a ``title`` and ``fields``, for each
@@ -219,7 +223,7 @@ def stress_chart(rows: Sequence[StressRow]) -> list[dict[str, Any]]:
     """
     if not rows:
         return []
-    index = {condition: k for k, condition in enumerate(rows[0].tables.conditions)}
+    index = {condition: k for k, condition in enumerate(stressed_runs(rows[0]).conditions)}
     groups: dict[str, list[dict[str, Any]]] = {
         title.capitalize(): [] for title in (*CATEGORIES.values(), _PAIRS)
     }
@@ -249,21 +253,16 @@ def title_of(condition: str) -> str:
     return condition
 
 
-def _field(entry: StressRow, at: int, title: str) -> dict[str, Any]:
-    figures = entry.tables.by_condition[at]
-    share, rise = figures["survived"], _float(figures["rise_cmH2O"])
-    unsafe = figures["unsafe_runs"]
+def _field(entry: Row, at: int, title: str) -> dict[str, Any]:
+    figures = stressed_runs(entry).by_condition[at]
+    share, unsafe = figures["survived"], figures["unsafe_runs"]
     return {
         "share": f"{100 * share:.0f}",
-        "rise": number(rise, 1, sign=True) if math.isfinite(rise) else NONE,
+        "rise": number(figures["rise_cmH2O"], 1, sign=True),
         "unsafe": unsafe,
         "shade": f"s{sum(share < limit for limit in SHARES)}",
-        "said": f"{entry.name}, {title}: {100 * share:.0f} % survived, {unsafe} unsafe",
+        "said": f"{entry.record.name}, {title}: {100 * share:.0f} % survived, {unsafe} unsafe",
     }
-
-
-def _float(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 #: Limits between the shades of maps, cmH2O and points of the normalised score: the same for all

@@ -13,6 +13,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,17 +22,16 @@ from ventbench.base.arrays import Floats, Ints
 from ventbench.base.interval import Interval
 from ventbench.board import comparison, gate, store
 from ventbench.board.canonical import RECORDS
-from ventbench.board.comparison import CMH2O, POINTS, Ranks
+from ventbench.board.comparison import CMH2O, POINTS
 from ventbench.board.gate import Evidence
 from ventbench.board.record import HardwareRecord, Record
-from ventbench.board.rounds import Round
+from ventbench.board.rounds import Round, key_of
 from ventbench.board.store import Store
 from ventbench.entries.manifest import TRACKS
 from ventbench.entries.runs import Runs
 from ventbench.task import protocol
 from ventbench.task.draws import DEVELOPMENT
 from ventbench.task.lungs import LUNG_IDS
-from ventbench.task.metrics import bootstrap
 
 #: The PID that each track's entries are compared with.
 BASELINES = {"performance": "pid_best", "robustness": "pid_robust"}
@@ -44,62 +44,76 @@ _MEASURED_DECIMALS = 3
 
 
 @dataclass(frozen=True)
-class Entry:
-    """A submission on one track and on the same draws, by the record that counts."""
+class Place:
+    """Where an entry stands among those that it is ranked with."""
 
-    record: Record  #: the newest one: of the official ones if there are any.
-    history: tuple[Record, ...]  #: all of its records, newest first.
-    reasons: tuple[str, ...]  #: why it is not ranked; empty if it is.
-    #: name of the earlier entry whose commands it follows; empty if there is none.
-    source: str = ""
+    rank: int  #: from 1. See :mod:`ventbench.board.comparison`.
+    best: int  #: best rank that it may have.
+    worst: int  #: worst rank.
 
-
-@dataclass(frozen=True)
-class Comparison:
-    """A score as mean over draws, and differences to others, cmH2O or points.
-
-    There is none to the baseline for the track's PID itself or without one, and none to the entry
-    above for the first.
-    """
-
-    score: Interval
-    to_baseline: Interval | None
-    to_above: Interval | None
+    @property
+    def range(self) -> str:
+        """Ranks that it may have, where they are several."""
+        return f"{self.best} to {self.worst}" if self.best < self.worst else ""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One ranked entry, or one shown beside them."""
+    """An entry: a submission on one track and on the same draws, by the record that counts."""
 
-    entry: Entry  #: whose row it is.
-    rank: int | None  #: from 1; None if it is not ranked. See :mod:`ventbench.board.comparison`.
-    ranks: tuple[int, int] | None  #: ranks that it may have; None if it is not ranked.
-    normalised: Comparison | None  #: the normalised score, which ranks; None if a cell failed.
-    error: Interval | None  #: the error of the same runs, cmH2O; None if a cell failed.
-    nominal: float  #: the paper's score, cmH2O; NaN if a cell failed.
-    #: highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed.
-    worst: tuple[float, str, float]
-
-    @property
-    def record(self) -> Record:
-        """The record that counts."""
-        return self.entry.record
-
-
-@dataclass(frozen=True)
-class StressRow:
-    """One entry under missing physics."""
-
-    row: Row  #: of the entry on the robustness track.
-    tables: Runs  #: its stressed runs.
-    score: Interval | None = None  #: stress score with its interval, cmH2O; None if a run failed.
-    rank: int | None = None  #: as of :class:`Row`; None if a run failed, or it has no rank.
-    ranks: tuple[int, int] | None = None  #: ranks that it may have.
+    record: Record  #: the newest one: of the official ones if there are any.
+    history: tuple[Record, ...]  #: all of its records, newest first.
+    status: str  #: ``"ranked"``, ``"practice"``, ``"not ranked"`` or ``"not official"``.
+    reasons: tuple[str, ...] = ()  #: why it is not ranked; empty if it is.
+    #: ranked scores of the seeds of its training, if its round holds any.
+    seeds: Sequence[float] = ()
+    #: name of the earlier entry whose commands it follows; empty if there is none.
+    source: str = ""
+    place: Place | None = None  #: None if it is not ranked.
+    stress_place: Place | None = None  #: the same under missing physics.
+    #: normalised score less that of the track's PID, and of the entry above; None without one.
+    to_baseline: Interval | None = None
+    to_above: Interval | None = None
 
     @property
-    def name(self) -> str:
-        """Name of the entry."""
-        return self.row.record.name
+    def listed(self) -> bool:
+        """Whether it stands in the table of its track: ranked, or would be on other draws."""
+        return self.status in ("ranked", "practice")
+
+    @cached_property
+    def normalised(self) -> Interval | None:
+        """The normalised score, which ranks; None if a cell failed."""
+        figures = self.record.figures
+        return figures.interval(figures.ranked_values)
+
+    @cached_property
+    def error(self) -> Interval | None:
+        """The error of the same runs, cmH2O; None if a cell failed."""
+        figures = self.record.figures
+        return figures.interval(figures.drawn[figures.ranked].mean(axis=2).T)
+
+    @cached_property
+    def stress(self) -> Interval | None:
+        """The stress score, cmH2O; None if a run failed, or it did not run under stress."""
+        runs = self.record.figures.stressed
+        if runs is None or not math.isfinite(runs.score):
+            return None
+        return Interval(runs.score, *runs.interval(runs.by_lung_and_draw))
+
+    @property
+    def worst(self) -> tuple[float, str, float]:
+        """Highest mean over draws of one cell, cmH2O, its lung and PIP; NaN if one failed."""
+        cells = self.record.figures.drawn.mean(axis=0)
+        if not np.isfinite(cells).all():
+            return np.nan, "", np.nan
+        i, j = np.unravel_index(np.argmax(cells), cells.shape)
+        return float(cells[i, j]), LUNG_IDS[i], protocol.PIPS[j]
+
+
+def stressed_runs(row: Row) -> Runs:
+    """Runs under missing physics of an entry that has some."""
+    assert row.record.figures.stressed is not None
+    return row.record.figures.stressed
 
 
 @dataclass(frozen=True)
@@ -110,10 +124,18 @@ class HardwareRow:
     reasons: tuple[str, ...]  #: why it has no rank; empty if it has one.
     newest: bool  #: whether no later one of the same entry and kind of device counts instead.
     simulated: Row | None  #: row of the entry in the simulated ranking; None if there is none.
-    nominal: float  #: nominal simulated score over the same lungs and PIPs, cmH2O; NaN without one.
     #: among the newest records over the same lungs and PIPs, from 1; None if it has none.
     rank: int | None = None
     count: int = 0  #: how many were ranked.
+
+    @property
+    def nominal(self) -> float:
+        """Nominal simulated score over the same lungs and PIPs, cmH2O; NaN without one."""
+        if self.simulated is None:
+            return math.nan
+        lungs = [LUNG_IDS.index(lung) for lung in self.record.header.lungs]
+        pips = [protocol.PIPS.index(pip) for pip in self.record.header.pips]
+        return float(self.simulated.record.figures.nominal[np.ix_(lungs, pips)].mean())
 
     @property
     def gap(self) -> float:
@@ -143,22 +165,21 @@ class Track:
     name: str  #: ``"performance"`` or ``"robustness"``.
     draws: str  #: name of the draws: of the round, or ``"development"``.
     round: Round | None  #: that ranks; None for practice, where nothing is.
-    ranked: tuple[Row, ...]  #: best first; in practice whatever could be ranked on other draws.
-    unranked: tuple[Row, ...]  #: official entries that are not ranked, with reasons, by name.
-    #: entries that nobody vouches for, or without a full sandbox, by name.
-    unofficial: tuple[Row, ...]
-    #: record of the track's PID, that the others are compared with; None if there is no ranked one.
-    baseline: Record | None
-    #: ranked entries that ran under the newest table of stressors, best first.
-    stress: tuple[StressRow, ...]
+    #: all entries: those that are listed, best first, then those that are not ranked and those
+    #: that nobody vouches for or that had no full sandbox, by name.
+    rows: tuple[Row, ...]
     hardware: tuple[HardwareRow, ...] = ()  #: hardware records of the track, newest first.
 
     @property
-    def rows(self) -> list[tuple[str, Row]]:
-        """All rows with their status, in the order in which they are shown."""
-        kinds = ("ranked" if self.round else "practice", "not ranked", "not official")
-        groups = (self.ranked, self.unranked, self.unofficial)
-        return [(kind, row) for kind, rows in zip(kinds, groups, strict=True) for row in rows]
+    def listed(self) -> list[Row]:
+        """Entries of the table, best first."""
+        return [row for row in self.rows if row.listed]
+
+    @property
+    def stress(self) -> list[Row]:
+        """Of these who ran under the newest table of stressors, best first."""
+        ran = [row for row in self.listed if row.record.figures.stressed is not None]
+        return sorted(ran, key=lambda x: (x.stress.value if x.stress else math.inf, x.record.name))
 
     @property
     def title(self) -> str:
@@ -203,36 +224,29 @@ def _track(
     histories: dict[str, list[Record]],
     evidence: Evidence,
 ) -> Track:
-    """Sort the entries of a track: ranked, not ranked, not official."""
+    """Sort the entries of a track: listed, not ranked, not official."""
     round_ = evidence.rounds.get(draws)
-    placed: dict[str, list[Entry]] = defaultdict(list)
+    rows: dict[str, list[Row]] = defaultdict(list)
     for _, history in sorted(histories.items()):
         # The one that is not withdrawn; nobody takes an official one's place.
         record = min(
             history, key=lambda x: (x.sha256 in evidence.withdrawn, not evidence.official(x))
         )
         why = gate.simulated(record, evidence)
+        status = "ranked"
         if round_ is None:
-            why = tuple(reason for reason in why if reason != gate.PRACTICE)
-        kind = "unranked" if why else "ranked"
-        kind = kind if evidence.official(record) else "unofficial"
-        placed[kind].append(Entry(record, tuple(history), why))
-    ranked = rank(derived(leaderboard, placed["ranked"]), name, ranks=round_ is not None)
-    records = [row.record for row in ranked]
-    base = _baseline(records, name)
-    return Track(
-        name=name,
-        draws=draws,
-        round=round_,
-        ranked=tuple(ranked),
-        unranked=tuple(_unranked_rows(placed["unranked"])),
-        unofficial=tuple(_unranked_rows(placed["unofficial"])),
-        baseline=None if base is None else records[base],
-        stress=tuple(_stress_rows(ranked, evidence)),
-    )
+            status, why = "practice", tuple(x for x in why if x != gate.PRACTICE)
+        status = "not ranked" if why else status
+        status = status if evidence.official(record) else "not official"
+        result, key = round_ and round_.result, key_of(record.name, record.track)
+        counts = result is not None and result.records.get(key) == record.sha256
+        seeds = result.seeds.get(key, ()) if result and counts else ()
+        rows[status].append(Row(record, tuple(history), status, why, seeds))
+    listed = rank(derived(leaderboard, rows["ranked"] + rows["practice"]))
+    return Track(name, draws, round_, (*listed, *rows["not ranked"], *rows["not official"]))
 
 
-def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
+def derived(leaderboard: Store, rows: Sequence[Row]) -> list[Row]:
     """Name the source of each entry whose commands follow those of an earlier one.
 
     The earlier one is that whose code was frozen first, in an earlier round or before it in the
@@ -243,16 +257,16 @@ def derived(leaderboard: Store, entries: Sequence[Entry]) -> list[Entry]:
         for entered in round_.entries:
             first.setdefault(entered.sha256, len(first))
 
-    def place(entry: Entry) -> tuple[bool, int]:
-        record = entry.record
+    def place(row: Row) -> tuple[bool, int]:
+        record = row.record
         code = record.header.submission.sha256
         return record.name not in BASELINES.values(), first.get(code, len(first))
 
-    order = sorted(entries, key=place)
+    order = sorted(rows, key=place)
     sources = comparison.sources([_commands(leaderboard, x.record) for x in order])
     return [
-        entry if at is None else replace(entry, source=order[at].record.name)
-        for entry, at in zip(order, sources, strict=True)
+        row if at is None else replace(row, source=order[at].record.name)
+        for row, at in zip(order, sources, strict=True)
     ]
 
 
@@ -263,124 +277,62 @@ def _commands(leaderboard: Store, record: Record) -> Floats:
     return last.reshape(-1, last.shape[-1])
 
 
-def rank(entries: Sequence[Entry], track: str, *, ranks: bool = True) -> list[Row]:
+def rank(rows: Sequence[Row]) -> list[Row]:
     """Rank complete entries, in any order, all over the same draws of a track.
 
-    Best first, those of equal score by name; without ``ranks`` the order is only practice.
+    Best first, those of equal score by name; in practice the order is all.
     """
-    ordered = sorted(entries, key=lambda e: e.record.name)
-    ordered.sort(key=lambda e: round(float(np.mean(e.record.figures.ranked_values)), DECIMALS))
+    ordered = sorted(rows, key=lambda x: x.record.name)
+    ordered.sort(key=lambda x: round(float(np.mean(x.record.figures.ranked_values)), DECIMALS))
     if not ordered:
         return []
-    records = [entry.record for entry in ordered]
-    rig = records[0].figures.rig[:, records[0].figures.ranked]
-    computed = _ranks(ordered, [record.figures.ranked_values for record in records], rig, POINTS)
-    compared = _comparisons(records, _baseline(records, track))
-    rows = []
-    for i, entry in enumerate(ordered):
-        may = (int(computed.best[i]), int(computed.worst[i]))
-        placement = (int(computed.rank[i]), may) if ranks else (None, None)
-        rows.append(_row(entry, *placement, compared[i]))
-    return rows
-
-
-def _ranks(entries: Sequence[Entry], values: Sequence[Floats], rig: Ints, matters: float) -> Ranks:
-    """Ranks by values of lungs and draws, ``(L, k)``; see :func:`comparison.ranks`."""
-    names = [entry.record.name for entry in entries]
-    source = [names.index(x.source) if x.source in names else None for x in entries]
-    return comparison.ranks(np.stack(values), rig, source, matters=matters)
-
-
-def _row(
-    entry: Entry, rank: int | None, ranks: tuple[int, int] | None, compared: Comparison | None
-) -> Row:
-    record, error = entry.record, None
-    if compared is not None:
-        values = record.figures.drawn[record.figures.ranked].mean(axis=2).T
-        error = _interval(values, _resampled(record, values))
-    nominal = float(record.figures.nominal.mean())
-    return Row(entry, rank, ranks, compared, error, nominal, worst(record))
-
-
-def _comparisons(records: Sequence[Record], base: int | None) -> list[Comparison]:
-    """Compare entries in the order of their ranks."""
-    values = [record.figures.ranked_values for record in records]
-    means = [_resampled(*pair) for pair in zip(records, values, strict=True)]
-    compared = []
-    for i, scores in enumerate(values):
+    figures = [row.record.figures for row in ordered]
+    values = [one.ranked_values for one in figures]
+    places = _places(ordered, values, figures[0].rig[:, figures[0].ranked], POINTS)
+    base = baseline(ordered)
+    ranked = []
+    for i, row in enumerate(ordered):
         to_baseline = to_above = None
-        if base is not None and base != i:
-            to_baseline = _interval(scores - values[base], means[i] - means[base])
+        if base is not None and base is not row:
+            to_baseline = figures[i].interval(values[i] - base.record.figures.ranked_values)
         if i:
-            to_above = _interval(scores - values[i - 1], means[i] - means[i - 1])
-        compared.append(Comparison(_interval(scores, means[i]), to_baseline, to_above))
-    return compared
+            to_above = figures[i].interval(values[i] - values[i - 1])
+        place = places[i] if row.status == "ranked" else None
+        ranked.append(replace(row, place=place, to_baseline=to_baseline, to_above=to_above))
+    return _ranked_under_stress(ranked)
 
 
-def _unranked_rows(entries: Sequence[Entry]) -> list[Row]:
-    """Rows of entries that are not ranked, by name; scores where they exist."""
-    rows = []
-    for entry in sorted(entries, key=lambda e: e.record.name):
-        complete = np.isfinite(entry.record.figures.drawn).all()
-        rows.append(
-            _row(entry, None, None, _comparisons([entry.record], None)[0] if complete else None)
-        )
-    return rows
+def baseline(rows: Sequence[Row]) -> Row | None:
+    """The track's PID among entries."""
+    return next((x for x in rows if x.record.name == BASELINES[x.record.track]), None)
 
 
-def _baseline(records: Sequence[Record], track: str) -> int | None:
-    """Index of the track's PID among records."""
-    names = [record.name for record in records]
-    return names.index(BASELINES[track]) if BASELINES[track] in names else None
+def _places(
+    rows: Sequence[Row], values: Sequence[Floats], rig: Ints, matters: float
+) -> list[Place]:
+    """Places by values of lungs and draws, ``(L, k)``; see :func:`comparison.ranks`."""
+    names = [row.record.name for row in rows]
+    source = [names.index(x.source) if x.source in names else None for x in rows]
+    computed = comparison.ranks(np.stack(values), rig, source, matters=matters)
+    columns = (computed.rank.tolist(), computed.best.tolist(), computed.worst.tolist())
+    return [Place(*place) for place in zip(*columns, strict=True)]
 
 
-def worst(record: Record) -> tuple[float, str, float]:
-    """Highest mean over draws of one cell, cmH2O, with its lung and PIP; NaN if any failed."""
-    cells = record.figures.drawn.mean(axis=0)
-    if not np.isfinite(cells).all():
-        return np.nan, "", np.nan
-    i, j = np.unravel_index(np.argmax(cells), cells.shape)
-    return float(cells[i, j]), LUNG_IDS[i], protocol.PIPS[j]
-
-
-def _resampled(record: Record, values: Floats) -> Floats:
-    """Resampled means of values of shape ``(L, k)``: the same ranked draws for every record."""
-    figures, some = record.figures, record.figures.ranked
-    return bootstrap.resampled_scores(values, figures.rig[:, some], figures.member[:, some])
-
-
-def _interval(values: Floats, means: Floats) -> Interval:
-    return Interval(float(np.mean(values)), *bootstrap.limits(means))
-
-
-def _stress_rows(rows: Sequence[Row], evidence: Evidence) -> list[StressRow]:
-    """Entries that ran under the newest table of stressors, best first; others are left out."""
-    ran = [(row, runs) for row in rows if (runs := row.record.figures.stressed) is not None]
-    stress_rows = [StressRow(row, runs) for row, runs in ran]
-    complete = [row for row in stress_rows if math.isfinite(row.tables.score)]
-    if not complete:
-        return stress_rows
-    fit = [row for row in complete if not gate.stressed(row.row.record, evidence)]
-    ranks = {}
-    if fit:
-        values = [row.tables.by_lung_and_draw for row in fit]
-        computed = _ranks([row.row.entry for row in fit], values, fit[0].tables.rig, CMH2O)
-        for i, row in enumerate(fit):
-            ranks[row.name] = int(computed.rank[i]), (int(computed.best[i]), int(computed.worst[i]))
-    scored = []
-    for row in complete:
-        low, high = row.tables.interval(row.tables.by_lung_and_draw)
-        score = Interval(row.tables.score, low, high)
-        place, may = ranks.get(row.name, (None, None))
-        scored.append(replace(row, score=score, rank=place, ranks=may))
-    scored.sort(key=lambda row: (row.tables.score, row.name))
-    return scored + [row for row in stress_rows if not math.isfinite(row.tables.score)]
+def _ranked_under_stress(rows: list[Row]) -> list[Row]:
+    """Give places under missing physics to those who have a rank, if no run of them failed."""
+    ran = {x.record.name: x for x in rows if x.place is not None and x.stress is not None}
+    if not ran:
+        return rows
+    runs = [stressed_runs(row) for row in ran.values()]
+    values = [one.by_lung_and_draw for one in runs]
+    places = dict(zip(ran, _places([*ran.values()], values, runs[0].rig, CMH2O), strict=True))
+    return [replace(row, stress_place=places.get(row.record.name)) for row in rows]
 
 
 def _hardware_rows(leaderboard: Store, track: Track) -> tuple[HardwareRow, ...]:
     """Rows of a track's hardware records, newest first."""
     evidence = leaderboard.evidence
-    simulated = {row.record.name: row for _, row in reversed(track.rows)}
+    simulated = {row.record.name: row for row in reversed(track.rows)}
     rows: list[HardwareRow] = []
     vouched_entries: set[tuple[str, bool]] = set()
     for record in reversed(leaderboard.records):
@@ -391,20 +343,9 @@ def _hardware_rows(leaderboard: Store, track: Track) -> tuple[HardwareRow, ...]:
         newest = record.sha256 not in evidence.withdrawn and key not in vouched_entries
         if newest and record.sha256 in evidence.vouched:
             vouched_entries.add(key)
-        row = simulated.get(record.name)
         why = gate.measured(record, evidence)
-        rows.append(HardwareRow(record, why, newest, row, _nominal(record, row)))
+        rows.append(HardwareRow(record, why, newest, simulated.get(record.name)))
     return tuple(_hardware_rank(row, rows) for row in rows)
-
-
-def _nominal(record: HardwareRecord, row: Row | None) -> float:
-    """Nominal simulated score over the lungs and PIPs of a hardware record, cmH2O."""
-    if row is None:
-        return math.nan
-    simulated, header = row.record, record.header
-    lungs = [LUNG_IDS.index(lung) for lung in header.lungs]
-    pips = [protocol.PIPS.index(pip) for pip in header.pips]
-    return float(simulated.figures.nominal[np.ix_(lungs, pips)].mean())
 
 
 def _hardware_rank(row: HardwareRow, all_rows: Sequence[HardwareRow]) -> HardwareRow:

@@ -165,7 +165,7 @@ class Round:
     def runs(self) -> dict[str, tuple[str, str, str]]:
         """Name, track and hash of the code, by the key of what is scored in a result."""
         return {
-            f"{x.name} ({track})": (x.name, track, x.sha256)
+            key_of(x.name, track): (x.name, track, x.sha256)
             for x in self.entries
             for track in x.tracks
         }
@@ -203,6 +203,11 @@ class Round:
         if self.result is not None and files.sha256(path) != self.result.bounds:
             raise InputError(f"{path} has been changed: it is not the file that {RESULT} names")
         return reference
+
+
+def key_of(entry: str, track: str) -> str:
+    """What an entry on a track is called in a result."""
+    return f"{entry} ({track})"
 
 
 def load(leaderboard: Path, name: str) -> Round:

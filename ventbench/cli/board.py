@@ -284,7 +284,7 @@ def show(
     folder = at_hand(folder)
     tracks = ranking.newest(frames.load_tracks(folder))
     console = written_console(
-        {"rows": [frames.csv_row(line) for line in frames.lines(tracks)]}, json
+        {"rows": [frames.csv_row(row) for row in frames.entries(tracks)]}, json
     )
     for track in tracks:
         _print_track(console, track)
@@ -304,11 +304,10 @@ def _print_track(console: Console, track: Track) -> None:
     if not track.rows:
         return
     console.print(_table(track))
-    for status, row in track.rows:
-        if status not in ("ranked", "practice"):
-            reasons = row.entry.reasons
-            reported = any(reason.startswith(status) for reason in reasons)
-            why = plain("; ".join(reasons if reported else (status, *reasons))[:300])
+    for row in track.rows:
+        if not row.listed:
+            reported = any(reason.startswith(row.status) for reason in row.reasons)
+            why = plain("; ".join(row.reasons if reported else (row.status, *row.reasons))[:300])
             console.print(f"{row.record.name}: {why}")
     if track.stress:
         console.print(_stress_table(track))
@@ -338,13 +337,13 @@ def _table(track: Track) -> Table:
     table.caption = f"{track.title}; error in cmH2O"
     for name in (*(name for column in columns for name in column.terminal), "record"):
         table.add_column(name, justify="left" if name in ("entry", "record") else "right")
-    for line in frames.lines([track]):
+    for row in track.rows:
         texts = []
         for column in columns:
-            cell = column.cell(line)
+            cell = column.cell(row)
             values = (cell["text"] if cell["value"] not in ("", None) else "", cell["small"])
             texts += values[: len(column.terminal)]
-        table.add_row(*texts, line.row.record.sha256[:HASH_DIGITS])
+        table.add_row(*texts, row.record.sha256[:HASH_DIGITS])
     return table
 
 
@@ -359,13 +358,13 @@ def _stress_table(track: Track) -> Table:
     for name in ("rank", "entry", "score", "95 %", "ranks", "calm", "survived", "unsafe"):
         table.add_column(name, justify="left" if name == "entry" else "right", no_wrap=True)
     for row in rows:
-        score, ranks = row["score"], row["ranks"]
+        score, place = row["score"], row["place"]
         table.add_row(
-            "" if row["rank"] is None else str(row["rank"]),
+            "" if place is None else str(place.rank),
             row["name"],
             "failed" if score is None else score["text"],
             "" if score is None else score["small"],
-            "" if ranks is None else f"{ranks[0]} to {ranks[1]}",
+            "" if place is None else f"{place.best} to {place.worst}",
             row["unstressed"],
             f"{row['survived']} %",
             str(row["unsafe"]),

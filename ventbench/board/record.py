@@ -221,7 +221,6 @@ def from_bytes(content: bytes, label: str) -> AnyRecord:
         InputError: if it is not a record.
     """
     values = schema.read(content, label, _DECODER)
-    canonical.parse(content, label)
     sha256 = canonical.digest(content)
     if isinstance(values, schema.WithdrawalContent):
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
@@ -261,7 +260,6 @@ def _checked(content: HardwareContent, sha256: str, label: str) -> HardwareRecor
     Raises:
         InputError: naming the first key that is wrong.
     """
-    schema.check_free(content.device.about, f"{label}, key device.about")
     _check_tables(content, label)
     errors, missing = np.array(content.errors, float), set()
     breath_bytes: set[bytes] = set()

@@ -216,7 +216,7 @@ class WithdrawalContent(Table, frozen=True, tag_field="kind", tag="withdrawal"):
 def read(
     content: bytes, label: str, decoder: msgspec.json.Decoder[Any]
 ) -> SubmittedContent | WithdrawalContent:
-    """Read and check the content of a record, canonical or not, of the kinds of a decoder.
+    """Read and check the content of a record of the kinds of a decoder.
 
     Raises:
         InputError: naming the first key that is wrong; ``label`` names the file.
@@ -233,13 +233,10 @@ def read(
         datetime.strptime(record.created, TIME_FORMAT)
     except ValueError:  # a time that no calendar has
         raise InputError(f"{label}, key created: {record.created} is no date and time") from None
+    for key, value in canonical.parse(content, label).items():
+        check_free(value, f"{label}, key {key}")
     if isinstance(record, WithdrawalContent):
         return record
-    for key in record.__struct_fields__:
-        if isinstance(free := getattr(record, key), dict):
-            check_free(free, f"{label}, key {key}")
-    check_free(record.submission.files, f"{label}, key submission.files")
-    check_free(record.submission.manifest.training, f"{label}, key submission.manifest")
     if isinstance(record, ScoreContent):
         _check_claims(record, label)
     _check_submission(record.submission, f"{label}, key submission")

@@ -27,7 +27,7 @@ def sha_of(folder: Path, name: str) -> str:
 
 
 def states(outcomes: list[official_runs.Outcome]) -> dict[str, str]:
-    return {outcome.name: outcome.state for outcome in outcomes}
+    return {outcome.record.name: outcome.state for outcome in outcomes}
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_commands_of_somebody_else_are_seen(board: Path, code: Path, again, simu
         "softer": official_runs.DIFFERENT,
         "absent": official_runs.NOT_RERUN,
     }
-    by_name = {outcome.name: str(outcome) for outcome in outcomes}
+    by_name = {outcome.record.name: str(outcome) for outcome in outcomes}
     forged, absent = by_name["softer"], by_name["absent"]
     assert "commands differ in 756 of 756 cells" in forged
     assert "first in cell (0, 0, 0), breath 1, step 1" in forged

@@ -23,6 +23,9 @@ from ventbench.base.errors import InputError, require
 ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
 
+#: Told how much of something is done, and how much there is of it.
+Progress = Callable[[int, int], object]
+
 #: Environment variable with the most threads.
 THREADS = "VENTBENCH_THREADS"
 
@@ -162,7 +165,7 @@ def in_order(
     pool: futures.Executor,
     function: Callable[..., ResultT],
     arguments: Iterable[tuple[Any, ...]],
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> list[ResultT]:
     """Return the results of jobs in the order of their arguments; errors as of :func:`results`.
 

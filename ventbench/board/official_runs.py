@@ -27,7 +27,7 @@ import numpy as np
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.base.executor import executor, results
+from ventbench.base.executor import Progress, executor, results
 from ventbench.board import canonical, create, gate, record, rounds, schema, store
 from ventbench.board.canonical import RECORDS, SEEDS
 from ventbench.board.record import Record
@@ -66,9 +66,7 @@ MAX_FOLDERS = 5000
 class Outcome:
     """What the second run of a record showed."""
 
-    record: str  #: SHA-256 of the record.
-    name: str  #: of the entry.
-    track: str  #: of the record.
+    record: Record  #: that was run again.
     state: str  #: ``"reproduced"``, ``"different"`` or ``"not re-run"``.
     #: what differs, or why it was not run again; for a reproduced record how close its commands
     #: are.
@@ -76,7 +74,8 @@ class Outcome:
 
     def __str__(self) -> str:
         detail = f": {self.detail}" if self.detail else ""
-        return f"record {self.record} ({self.name}, {self.track}): {self.state}{detail}"
+        record = self.record
+        return f"record {record.sha256} ({record.name}, {record.track}): {self.state}{detail}"
 
 
 def sandboxed() -> Runner:
@@ -100,7 +99,7 @@ def rerun(
     scheduler: str | None = None,
     load: Load = frozen.load,
     runner: Callable[[], Runner] = sandboxed,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> list[Outcome]:
     """Run the code of records again and compare commands.
 
@@ -139,7 +138,7 @@ def rerun(
             round_ = board.evidence.rounds.get(score.header.draws.season)
             todo[score.sha256] = score, round_, code, folder.resolve(), load, runner
             continue
-        outcomes[score.sha256] = Outcome(score.sha256, score.name, score.track, NOT_RERUN, why)
+        outcomes[score.sha256] = Outcome(score, NOT_RERUN, why)
     with executor(workers, scheduler) as pool:
         for done, (sha256, outcome) in enumerate(results(pool, _run, todo), 1):
             outcomes[sha256] = outcome
@@ -202,14 +201,14 @@ def _run(
             if not detail and failed != named:
                 detail = f"{len(failed)} cells failed, {len(named)} in the record"
             if detail:
-                return Outcome(score.sha256, score.name, score.track, DIFFERENT, detail)
+                return Outcome(score, DIFFERENT, detail)
             off = np.abs(recorded - again).max()
             closest.append(f"commands within {off:.1e} %" if off else "to the bit")
     except (InputError, FloatingPointError) as error:
         why = f"its code cannot be run: {error}"
-        return Outcome(score.sha256, score.name, score.track, DIFFERENT, why)
+        return Outcome(score, DIFFERENT, why)
     closeness = ", under stress ".join(closest)
-    return Outcome(score.sha256, score.name, score.track, REPRODUCED, closeness)
+    return Outcome(score, REPRODUCED, closeness)
 
 
 def difference(recorded: Floats, again: Floats) -> str:
@@ -237,7 +236,8 @@ def difference(recorded: Floats, again: Floats) -> str:
 #: stressed runs too. As ``time ventbench score pid_robust`` counts; networks take twice as long.
 SECONDS = {"performance": 13.0, "robustness": 58.0}
 
-Progress = Callable[[str, int, int], None]
+#: Told what is going on, and how far it is.
+StageProgress = Callable[[str, int, int], None]
 
 
 def plan(round_: Round) -> list[tuple[str, str]]:
@@ -246,9 +246,9 @@ def plan(round_: Round) -> list[tuple[str, str]]:
     Raises:
         InputError: if it is not drawn, or is scored already.
     """
-    if round_.state != "drawn" or round_.frozen is None:
+    if round_.state != "drawn":
         raise InputError(f"round {round_.name} is {round_.state}; it is scored once it is drawn")
-    return [(entry.name, track) for entry in round_.frozen.entries for track in entry.tracks]
+    return [run[:2] for run in round_.runs.values()]
 
 
 def code_of(round_: Round, places: Iterable[Path]) -> dict[str, Path]:
@@ -257,10 +257,9 @@ def code_of(round_: Round, places: Iterable[Path]) -> dict[str, Path]:
     Raises:
         InputError: naming the entries whose code is not at hand.
     """
-    assert round_.frozen is not None
     found = code_in(places)
-    code = {x.name: found[x.sha256] for x in round_.frozen.entries if x.sha256 in found}
-    if missing := sorted({x.name for x in round_.frozen.entries} - set(code)):
+    code = {x.name: found[x.sha256] for x in round_.entries if x.sha256 in found}
+    if missing := sorted({x.name for x in round_.entries} - set(code)):
         raise InputError(
             f"the code of {', '.join(missing)}, as it was frozen, is not at hand; give --source DIR"
         )
@@ -274,7 +273,7 @@ def bounds_of(
     folder: Path,
     *,
     starts: tuple[int, ...] = attainable.STARTS,
-    progress: references.Progress | None = None,
+    progress: Progress | None = None,
 ) -> Reference:
     """Best attainable and best PID of the draws of a round, with the PIDs of the protocol."""
     rigs = rigs_of(simulators)
@@ -301,7 +300,7 @@ def bound(
     *,
     load: Load = frozen.load,
     starts: tuple[int, ...] = attainable.STARTS,
-    progress: references.Progress | None = None,
+    progress: Progress | None = None,
 ) -> Round:
     """Write the bounds of a round's draws, unless they are there; runs no submission.
 
@@ -343,7 +342,7 @@ def score(
     runner: Callable[[], Runner] = sandboxed,
     secret: str | None = None,
     starts: tuple[int, ...] = attainable.STARTS,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> Round:
     """Score every frozen entry, write its records, and close the round.
 
@@ -373,8 +372,7 @@ def score(
         leaderboard, name, pool, work, load=load, starts=starts, progress=bounds_progress
     )
     bounds = files.sha256(round_.folder / BOUNDS)
-    assert round_.frozen is not None
-    chosen = [x for x in round_.frozen.entries if x.name in (only or code)]
+    chosen = [x for x in round_.entries if x.name in (only or code)]
     jobs = {
         x.name: (leaderboard.resolve(), name, x, code[x.name], work.resolve(), load, runner)
         for x in chosen
@@ -428,7 +426,7 @@ def _score_entry(
     of_seeds: dict[str, list[schema.Commands]] = {}
     with TemporaryDirectory() as place:
         for track, seed in itertools.product(entry.tracks, ["", *(x.name for x in seeds(code))]):
-            key = f"{entry.name} ({track})"
+            key = rounds.key_of(entry.name, track)
             try:
                 at = Path(place) / f"{track}{seed}"
                 submission = frozen_copy(code, entry.sha256, at)
@@ -473,7 +471,7 @@ def close(
     *,
     load: Load = frozen.load,
     secret: str | None = None,
-    progress: Progress | None = None,
+    progress: StageProgress | None = None,
 ) -> Round:
     """Write records and result of a round from what the jobs of its entries left; runs none.
 
@@ -492,31 +490,27 @@ def close(
         OSError: if a file cannot be written.
     """
     round_, simulators = _load_scorable(leaderboard, name), load()
-    assert round_.frozen is not None
     result = Result(files.sha256(round_.folder / BOUNDS), {})
     of_seeds: dict[str, list[schema.Commands]] = {}
-    for index, entry in enumerate(round_.frozen.entries):
-        for track in entry.tracks:
-            key, folder = f"{entry.name} ({track})", _job(work, entry.name)
-            try:
-                job_result = _job_result(folder / RESULT, result.bounds)
-                if (sha256 := job_result.records.get(key)) is None:
-                    raise InputError(job_result.failed.get(key, "its job left no record"))
-                path, commands, scores = _take(
-                    leaderboard, folder, sha256, round_, entry, track, simulators
-                )
-            except (InputError, OSError) as error:
-                result.failed[key] = str(error)[: schema.MAX_TEXT]
-                continue
-            if secret:
-                gate.sign(leaderboard, path, secret)
-            result.records[key] = sha256
-            if scores:
-                of_seeds[key], result.seeds[key] = commands, scores
-            seeds_failed = (x for x in job_result.failed if x.startswith(f"{key}, seed "))
-            result.failed.update({x: job_result.failed[x][: schema.MAX_TEXT] for x in seeds_failed})
+    for count, key in enumerate(round_.runs, 1):
+        folder = _job(work, round_.runs[key][0])
+        try:
+            job_result = _job_result(folder / RESULT, result.bounds)
+            if (sha256 := job_result.records.get(key)) is None:
+                raise InputError(job_result.failed.get(key, "its job left no record"))
+            path, commands, scores = _take(leaderboard, folder, sha256, round_, key, simulators)
+        except (InputError, OSError) as error:
+            result.failed[key] = str(error)[: schema.MAX_TEXT]
+            continue
+        if secret:
+            gate.sign(leaderboard, path, secret)
+        result.records[key] = sha256
+        if scores:
+            of_seeds[key], result.seeds[key] = commands, scores
+        seeds_failed = (x for x in job_result.failed if x.startswith(f"{key}, seed "))
+        result.failed.update({x: job_result.failed[x][: schema.MAX_TEXT] for x in seeds_failed})
         if progress is not None:
-            progress("records", index + 1, len(round_.frozen.entries))
+            progress("records", count, len(round_.runs))
     _write(round_.folder, of_seeds, result)
     if secret:
         gate.sign(leaderboard, round_.folder / RESULT, secret)
@@ -528,8 +522,7 @@ def _take(
     folder: Path,
     sha256: str,
     round_: Round,
-    entry: Entered,
-    track: str,
+    key: str,
     simulators: ReplayPlants,
 ) -> tuple[Path, list[schema.Commands], list[float]]:
     """Add the record that a job left, unless it is there; InputError if it is of anything else.
@@ -542,13 +535,11 @@ def _take(
     candidate = record.load(source)
     if not isinstance(candidate, Record) or (
         candidate.sha256,
-        candidate.name,
-        candidate.track,
-        candidate.header.submission.sha256,
+        candidate.run,
         candidate.header.draws.sha256,
-    ) != (sha256, entry.name, track, entry.sha256, round_.commitment):
-        raise InputError(f"{source.name} is not the record of {entry.name} ({track}) in this round")
-    commands = rounds.seed_commands(folder).get(f"{entry.name} ({track})", [])[:MAX_SEEDS]
+    ) != (sha256, round_.runs[key], round_.commitment):
+        raise InputError(f"{source.name} is not the record of {key} in this round")
+    commands = rounds.seed_commands(folder).get(key, [])[:MAX_SEEDS]
     scores = seed_scores(candidate, commands, folder, simulators, round_, {})
     if source != path:
         replayed = functools.partial(require_replay, simulators)

@@ -91,14 +91,9 @@ def _printable(value: Any) -> Any:
     return plain(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
-def figure(value: float, digits: int = 3) -> str:
+def figure(value: float, digits: int = 3, *, sign: bool = False) -> str:
     """A number; a dash if it does not exist."""
-    return number(value, digits) if math.isfinite(value) else NONE
-
-
-def signed(value: float, digits: int = 3) -> str:
-    """A number with its sign; a dash if it does not exist."""
-    return number(value, digits, sign=True) if math.isfinite(value) else NONE
+    return number(value, digits, sign=sign) if math.isfinite(value) else NONE
 
 
 def interval(estimate: Interval | None, digits: int, *, sign: bool = False) -> dict[str, Any]:
@@ -147,7 +142,7 @@ def hardware_context(row: HardwareRow) -> dict[str, Any]:
         "score": "stopped" if stopped else figure(record.score),
         "spread": spread,
         "expected": figure(row.nominal),
-        "gap": signed(row.gap),
+        "gap": figure(row.gap, sign=True),
         "same_code": row.same_code,
         "device": "emulator" if record.emulated else header.device.name,
         "lungs": [

@@ -25,6 +25,7 @@ from jax import Array
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
+from ventbench.base.executor import Progress
 from ventbench.board import canonical, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.figures import Figures
@@ -267,7 +268,7 @@ def with_figures(
     problem: Callable[[str], object],
     *,
     note: Callable[[str], object] = lambda text: None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
     memo: Memo | None = None,
     cached: bool = False,
 ) -> Store:

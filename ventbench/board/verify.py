@@ -23,6 +23,7 @@ import numpy as np
 
 from ventbench.base import files
 from ventbench.base.errors import InputError
+from ventbench.base.executor import Progress
 from ventbench.board import build, canonical, frames, gate, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import code_in, folders
@@ -58,9 +59,6 @@ RECOMPUTED = 24
 
 T = TypeVar("T")
 U = TypeVar("U")
-
-#: Told how many records of how many have been replayed.
-Progress = Callable[[int, int], None]
 
 #: Marks of the board's table in the README beside a leaderboard.
 _TABLE = re.compile(r"<!-- board -->\n(.*?)\n<!-- end -->", re.S)

@@ -31,7 +31,7 @@ from ventbench.cli.options import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from ventbench.entries.cells import Progress
+    from ventbench.base.executor import Progress
     from ventbench.entries.folder import Submission
     from ventbench.entries.result import Score
 

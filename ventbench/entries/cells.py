@@ -24,6 +24,7 @@ from jax import Array
 from ventbench.base import compilation
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.base.executor import Progress
 from ventbench.entries.folder import Submission
 from ventbench.entries.reference import Reference, reference_of
 from ventbench.entries.runs import pip_columns
@@ -272,9 +273,6 @@ class InProcessRunner:
         """Make and reset one fresh controller for each cell; see :class:`Runner`."""
         return InProcessSession(submission, tasks)
 
-
-#: Called with rounds of commands that are done, and all of them.
-Progress = Callable[[int, int], object]
 
 #: Rounds of a run: a command of each cell.
 ROUNDS = protocol.BREATHS * protocol.INSPIRATION_STEPS

@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ventbench.base.arrays import Floats
-from ventbench.entries.cells import ROUNDS, Progress, Runner, counted
+from ventbench.base.executor import Progress
+from ventbench.entries.cells import ROUNDS, Runner, counted
 from ventbench.entries.folder import (
     CONTROLLER,
     SEEDS,

@@ -11,7 +11,7 @@ import functools
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.base.executor import InProcess
+from ventbench.base.executor import InProcess, Progress
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint, kept_results
 from ventbench.controllers.pid import PID
 from ventbench.task import attainable, protocol, rollouts
@@ -61,8 +61,6 @@ PID_GAINS = (
     (1.87, 21.4, 15.8),
     (1.96, 23.0, 0.14),
 )
-
-Progress = Callable[[int, int], None]
 
 # Steps that the second start of a further breath opens the valve fully for.
 _FEW_STEPS = 4

@@ -13,10 +13,10 @@ import numpy as np
 
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
+from ventbench.base.executor import Progress
 from ventbench.entries.cells import (
     ROUNDS,
     Cells,
-    Progress,
     ProtocolRun,
     Runner,
     counted,

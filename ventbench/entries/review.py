@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from ventbench.entries.folder import CONTROLLER, MAX_BYTES, check_files
-from ventbench.entries.manifest import RULES, Finding, by_word, check_manifest
+from ventbench.entries.manifest import RULES, Finding, Group, by_word, check_manifest
 from ventbench.sandbox.child.cell import source_text
 from ventbench.sandbox.child.sources import Import, imports, module_files, sources
 from ventbench.sandbox.pipes import OPTIONAL
@@ -34,9 +34,11 @@ from ventbench.sandbox.reader import UnreadableError, read_apart
 
 
 def check_sources(folder: Path) -> list[Finding]:
-    """Look at ``controller.py`` and all of the folder's modules that it imports.
+    """Find what is wrong with the sources of a folder, and note what a reviewer should look at.
 
-    Other sources, such as the training's, need only be Python.
+    What is imported matters in ``controller.py`` and all of the folder's modules that it imports;
+    other sources, such as the training's, need only be Python. Call it in a limited process, see
+    :mod:`ventbench.sandbox.reader`.
     """
     findings, trees = [], {}
     for path in sources(folder):
@@ -48,6 +50,7 @@ def check_sources(folder: Path) -> list[Finding]:
             findings.append(tree)
         else:
             trees[name] = tree
+            findings += _notes(path, name, tree)
     if CONTROLLER in trees:
         try:
             findings += _check_imports(trees)
@@ -143,30 +146,16 @@ _NAMES = _ATTRIBUTES | _CALLS
 _ADVICE = "for the reviewer: make sure that it is what it seems to be"
 
 
-def review(folder: Path) -> list[Finding]:
-    """List what a reviewer should look at in a folder, as notes.
-
-    Call it in a limited process, see :mod:`ventbench.sandbox.reader`.
-    """
-    notes = []
-    for path in sources(folder):
-        name = path.relative_to(folder).as_posix()
-        tree = _parsed(path, name)
-        if isinstance(tree, Finding):
-            continue  # check_sources says so
-        notes += [
-            Finding("source", name, message, _ADVICE, line, problem=False)
-            for line, message in _characters(source_text(path.read_bytes()))
-        ]
-        noted = set()
-        for node in ast.walk(tree):
-            for used, why in _uses(node):
-                line = getattr(node, "lineno", None)
-                if (used, line) not in noted:
-                    noted.add((used, line))
-                    message = f"uses {used}, which {why}"
-                    notes.append(Finding("source", name, message, _ADVICE, line, problem=False))
-    return sorted(notes, key=lambda note: (note.file, note.line or 0))
+def _notes(path: Path, name: str, tree: ast.Module) -> list[Finding]:
+    """Notes on what a source holds and uses, each once a line."""
+    held = _characters(source_text(path.read_bytes()))
+    used = (
+        (getattr(node, "lineno", None), f"uses {what}, which {why}")
+        for node in ast.walk(tree)
+        for what, why in _uses(node)
+    )
+    noted = dict.fromkeys([*held, *used])
+    return [Finding("source", name, what, _ADVICE, line, problem=False) for line, what in noted]
 
 
 def _characters(text: str) -> Iterator[tuple[int, str]]:
@@ -229,15 +218,14 @@ def _module(name: str) -> Iterator[tuple[str, str]]:
 #: Most findings of one kind that are listed.
 LISTED = 200
 
-_CHECKS: Mapping[str, Callable[[Path], list[Finding]]] = {
+_CHECKS: Mapping[Group, Callable[[Path], list[Finding]]] = {
     "manifest": lambda folder: check_manifest(folder)[0],
     "files": check_files,
-    "sources": check_sources,
-    "review": review,
+    "source": check_sources,
 }
 
 
-def findings_as_json(folder: str, *checks: str) -> list[dict[str, Any]]:
+def findings_as_json(folder: str, *checks: Group) -> list[dict[str, Any]]:
     """Make some of :data:`_CHECKS` on a folder, for a process that answers in JSON."""
     listed = []
     for check in checks:
@@ -252,24 +240,16 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
     """Return what is wrong with the manifest, the files and the sources of a submission.
 
     One process makes all checks. Where a check ends the process, each check gets its own, so that
-    the answer says which files cannot be read and still has what the other checks find. Sources
-    that one check cannot read are not read by another, which would take as long to say the same.
-    Nothing in the folder is run or imported.
+    the answer says which files cannot be read and still has what the other checks find. Nothing in
+    the folder is run or imported.
     """
     function, findings = "ventbench.entries.review:findings_as_json", list[Finding]()
     with contextlib.suppress(UnreadableError):
         return tuple(Finding(**fields) for fields in read_apart(function, folder, [*_CHECKS]))
-    unread = set[str]()
-    for check in _CHECKS:
-        group = check if check in ("manifest", "files") else "source"
-        if group in unread:
-            continue
+    for group in _CHECKS:
         try:
-            answer = read_apart(function, folder, [check])
+            findings += [Finding(**fields) for fields in read_apart(function, folder, [group])]
         except UnreadableError as error:
-            unread.add(group)
             advice = "make its files smaller and plainer"
-            findings.append(Finding(group, "the folder", str(error), advice))  # type: ignore[arg-type]
-            continue
-        findings += [Finding(**finding) for finding in answer]
+            findings.append(Finding(group, "the folder", str(error), advice))
     return tuple(findings)

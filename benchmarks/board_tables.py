@@ -63,9 +63,9 @@ def main(write: bool = False) -> None:
         return
     (best, first), *others = runs.items()
     for name, entry in others:
-        difference, (low, high) = first.difference(entry)
-        limits = f"paired 95 % interval {low:+.3f} to {high:+.3f}"
-        print(f"{best} less {name}: {difference:+.3f} cmH2O, {limits}")
+        lead = first.difference(entry)
+        limits = f"paired 95 % interval {lead.low:+.3f} to {lead.high:+.3f}"
+        print(f"{best} less {name}: {lead.value:+.3f} cmH2O, {limits}")
 
 
 if __name__ == "__main__":

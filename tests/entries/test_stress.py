@@ -201,17 +201,19 @@ def test_the_plateau_may_be_off_by_2_cmH2O_and_4_percent(cells: Cells) -> None:
 
 
 def test_an_interval_needs_two_draws_and_holds_the_mean(runs: Runs) -> None:
-    assert all(math.isnan(x) for x in runs.interval(runs.error[0]))
+    alone = runs.interval(runs.error[0])
+    assert math.isnan(alone.low)
+    assert math.isnan(alone.high)
     cells = _six()
     pips = cells.pips[..., 0]
     six = dataclasses.replace(runs, rig=cells.rig, member=cells.member, pips=pips)
     lung, noise = np.arange(6.0)[:, None], np.random.default_rng(0).normal(size=(6, 6))
-    low, high = six.interval(lung + 0.1 * pips)
-    assert high - low < 1e-9  # lungs and PIPs are no chance
-    low, high = six.interval(lung + 0.1 * pips + noise)
-    mean = 2.5 + 2.25 + noise.mean()
-    assert low < mean < high
-    assert high - low > 0.5 * 2 * 1.96 * noise.std() / 6
+    made = six.interval(lung + 0.1 * pips)
+    assert made.high - made.low < 1e-9  # lungs and PIPs are no chance
+    made = six.interval(lung + 0.1 * pips + noise)
+    assert made.value == pytest.approx(2.5 + 2.25 + noise.mean())
+    assert made.low < made.value < made.high
+    assert made.high - made.low > 0.5 * 2 * 1.96 * noise.std() / 6
 
 
 def test_a_difference_is_paired(runs: Runs) -> None:
@@ -220,8 +222,8 @@ def test_a_difference_is_paired(runs: Runs) -> None:
     drawn = {"rig": cells.rig, "member": cells.member, "pips": cells.pips[..., 0]}
     one = dataclasses.replace(runs, **drawn, error=error)
     two = dataclasses.replace(one, error=error + 0.25)
-    difference, (low, high) = two.difference(one)
-    assert (difference, low, high) == pytest.approx((0.25, 0.25, 0.25))
+    made = two.difference(one)
+    assert (made.value, made.low, made.high) == pytest.approx((0.25, 0.25, 0.25))
     with pytest.raises(InputError, match="different"):
         two.difference(runs)
 

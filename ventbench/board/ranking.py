@@ -98,7 +98,7 @@ class Row:
         runs = self.record.figures.stressed
         if runs is None or not math.isfinite(runs.score):
             return None
-        return Interval(runs.score, *runs.interval(runs.by_lung_and_draw))
+        return runs.interval(runs.by_lung_and_draw)
 
     @property
     def worst(self) -> tuple[float, str, float]:

@@ -256,12 +256,13 @@ class Score:
         more = len(self.failed) - len(failures)
         sentences = [*failures, *([f"... {more} more"] * (more > 0))]
         if (runs := self.stressed) is not None:
-            low, high = runs.interval(runs.by_lung_and_draw)
+            score = runs.interval(runs.by_lung_and_draw)
             failed = f"failed in {len(runs.failures)} runs"
             sentences.append(
                 f"Under missing physics: {failed}"
-                if math.isnan(runs.score)
-                else f"Under missing physics: {runs.score:.3f} cmH2O [{low:.3f}, {high:.3f}], "
+                if math.isnan(score.value)
+                else f"Under missing physics: {score.value:.3f} cmH2O [{score.low:.3f}, "
+                f"{score.high:.3f}], "
                 f"{runs.unstressed:.3f} without; {100 * runs.survived_share:.0f} % survived, "
                 f"{int(np.sum(~runs.safe[1:]))} of {runs.safe[1:].size} runs unsafe. What costs "
                 "most:"

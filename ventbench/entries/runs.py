@@ -18,6 +18,7 @@ import numpy as np
 
 from ventbench.base.arrays import Bools, Floats, Ints
 from ventbench.base.errors import InputError
+from ventbench.base.interval import Interval
 from ventbench.sandbox.child.cell import Failure
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
@@ -146,21 +147,22 @@ class Runs:
         """Weighted mean error of the stressed conditions, cmH2O, ``(L, n)``; NaN if one failed."""
         return self.over_conditions(self.error)
 
-    def interval(self, values: Floats) -> tuple[float, float]:
-        """95 % interval of a mean over cells, with draws, rigs and ensemble members resampled.
+    def interval(self, values: Floats) -> Interval:
+        """A mean over cells with its interval: draws, rigs and ensemble members resampled.
 
         Alike for all entries. PIPs are chosen, not drawn, and lungs and PIPs form a Latin square:
         what a PIP adds on average is taken out before, as what a lung adds is. Values ``(L, n)`` of
         any unit, such as a mean over conditions.
         """
-        if values.shape[1] < 2 or not np.isfinite(values).all():
-            return math.nan, math.nan
+        mean = float(np.mean(values))
+        if values.shape[1] < 2 or not math.isfinite(mean):
+            return Interval(mean)
         levels, index, count = np.unique(self.pips, return_inverse=True, return_counts=True)
         if count.min() > 1:
             index = index.reshape(values.shape)
             sums = np.bincount(index.ravel(), weights=values.ravel(), minlength=len(levels))
-            values = values - (sums / count)[index] + values.mean()
-        return limits(resampled_scores(values, self.rig, self.member))
+            values = values - (sums / count)[index] + mean
+        return Interval(mean, *limits(resampled_scores(values, self.rig, self.member)))
 
     def comparable(self, baseline: Runs) -> bool:
         """Whether another entry was run under the same conditions on the same draws."""
@@ -173,7 +175,7 @@ class Runs:
             )
         )
 
-    def difference(self, baseline: Runs) -> tuple[float, tuple[float, float]]:
+    def difference(self, baseline: Runs) -> Interval:
         """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
 
         Raises:
@@ -181,8 +183,7 @@ class Runs:
         """
         if not self.comparable(baseline):
             raise InputError("these entries were run under different conditions or draws")
-        change = self.by_lung_and_draw - baseline.by_lung_and_draw
-        return float(change.mean()), self.interval(change)
+        return self.interval(self.by_lung_and_draw - baseline.by_lung_and_draw)
 
     def to_frame(self) -> pd.DataFrame:
         """One row a run.
@@ -228,18 +229,16 @@ class Runs:
     def headline(self) -> dict[str, Any]:
         """What a table shows of an entry, as JSON values: score, rise, survival, safety, worst."""
         worst = max(self.by_condition[1:], key=lambda row: _order(row["error_cmH2O"]))
-        stressed, rise = self.by_lung_and_draw, self.over_conditions(self.rise)
+        rise = self.interval(self.over_conditions(self.rise))
         return {
             "score": number(self.score),
-            "ci95": [number(limit) for limit in self.interval(stressed)],
+            "ci95": _ci95(self.interval(self.by_lung_and_draw)),
             "unstressed": number(self.unstressed),
-            "rise": number(np.mean(rise)),
-            "rise_ci95": [number(limit) for limit in self.interval(rise)],
+            "rise": number(rise.value),
+            "rise_ci95": _ci95(rise),
             "held_out_score": number(self.held_out_score),
             "survived": self.survived_share,
-            "survived_ci95": [
-                number(limit) for limit in self.interval(self.survived[1:].mean(axis=0))
-            ],
+            "survived_ci95": _ci95(self.interval(self.survived[1:].mean(axis=0))),
             "survived_unstressed": float(np.mean(self.survived[0])),
             "unsafe_runs": int(np.sum(~self.safe[1:])),
             "stressed_runs": int(self.safe[1:].size),
@@ -264,9 +263,9 @@ class Runs:
             "severity": condition.severity,
             "category": category_of(condition),
             "error_cmH2O": number(np.mean(error)),
-            "ci95": [number(limit) for limit in self.interval(error)],
+            "ci95": _ci95(self.interval(error)),
             "rise_cmH2O": number(np.mean(self.rise[k])),
-            "rise_ci95": [number(limit) for limit in self.interval(self.rise[k])],
+            "rise_ci95": _ci95(self.interval(self.rise[k])),
             "survived": float(np.mean(self.survived[k])),
             "unsafe_runs": int(np.sum(~self.safe[k])),
             "above_alarm_s": number(np.mean(self.alarm_s[k])),
@@ -298,6 +297,10 @@ def category_of(condition: Condition) -> str:
 def number(value: float | np.floating) -> float | None:
     """A JSON number; None where it does not exist."""
     return float(value) if math.isfinite(value) else None
+
+
+def _ci95(estimate: Interval) -> list[float | None]:
+    return [number(estimate.low), number(estimate.high)]
 
 
 def _order(value: float | None) -> float:

@@ -262,7 +262,7 @@ class Watched:
         random: np.random.Generator,
     ) -> None:
         self._mounted, self._lungs, self._pips, self._random = mounted, lungs, pips, random
-        self.checks = [safety.init(parse_lung(label)) for label in labels]
+        self.checks = [safety.SafetyState(parse_lung(label)) for label in labels]
         self.u_in, self._u_out, self._steps = np.zeros(len(pips)), np.ones(len(pips)), 0
 
     def look(self) -> tuple[Floats, Floats]:
@@ -434,7 +434,7 @@ def breathe(
     n, lungs = len(labels), mounted.begin()
     watched = Watched(mounted, lungs, labels, pips, np.random.default_rng(list(SEED)))
     watched.u_in = np.full(n, BIAS)
-    states = [fallback.init(parse_lung(label)) for label in labels]
+    states = [fallback.FallbackState(parse_lung(label)) for label in labels]
     ended, vented, tripped = np.zeros(n, bool), np.zeros(n, bool), np.zeros(n, bool)
     pressure = np.full((n, protocol.BREATHS, protocol.BREATH_STEPS), np.nan)
     for breath, step in np.ndindex(pressure.shape[1:]):

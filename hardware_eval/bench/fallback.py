@@ -85,7 +85,7 @@ DEFAULT = FallbackSettings()
 
 @dataclass(frozen=True)
 class FallbackState:
-    """State between two steps.
+    """State between two steps; with the lung alone, before the first breath, at rest.
 
     Attributes:
         lung: label of the mounted lung.
@@ -114,11 +114,6 @@ class FallbackState:
     longest: int = 0
 
 
-def init(lung: Lung) -> FallbackState:
-    """State before the first breath, the lung at rest."""
-    return FallbackState(lung)
-
-
 def step(
     settings: FallbackSettings,
     state: FallbackState,
@@ -132,7 +127,7 @@ def step(
 
     Args:
         settings: bounds.
-        state: from :func:`init` or the step before.
+        state: of a lung at rest, or of the step before.
         time_step: step of the breath, from 0.
         pressure: reading, cmH2O; NaN if there is none.
         pip: target, cmH2O.
@@ -150,8 +145,7 @@ def step(
     share = protocol.DT / (protocol.DT + 0.5)
     integral = state.integral + share * (error - state.integral) if known else state.integral
     # Nothing is safer than a valve that is closed.
-    opens = answer is not None and answer > 0.0
-    outside = opens and not is_inside(settings, state, pip, answer or 0.0)
+    outside = bool(answer) and answer > 0.0 and not is_inside(settings, state, pip, answer)
     good = 0 if answer is None or outside else state.good + 1
     active = not good or (state.active and good <= settings.hand_back)
     if active or answer is None:

@@ -247,7 +247,7 @@ class Watched:
         self.log, self.answered, self.last = BreathLog(), list[bool](), (0.0, 1)
         self.ended: Ended | None = None
         self.missed = 0
-        self._safety = safety.init(self._lung)
+        self._safety = safety.SafetyState(self._lung)
         client.vent()
         clock.sleep_until(clock.now() + self._bench.rest)
         self._start = self._deadline = clock.now() + protocol.DT
@@ -375,8 +375,7 @@ def run_once(
     try:
         return loop.run()
     finally:
-        with contextlib.suppress(LinkError):  # then the watchdog vents
-            bench.client.vent()
+        loop.vent()
 
 
 class _Loop(Watched):
@@ -391,7 +390,7 @@ class _Loop(Watched):
     ) -> None:
         super().__init__(bench, run.lung, run.pip)
         self._run, self._controller, self._on_breath = run, controller, on_breath
-        self._fallback = fallback.init(self._lung)
+        self._fallback = fallback.FallbackState(self._lung)
         self._breaths: list[BreathLog] = []
         self._asked = self._late_answers = self._limited = 0
         self._disturbed = False

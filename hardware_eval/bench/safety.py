@@ -111,7 +111,7 @@ class Trip:
 
 @dataclass(frozen=True)
 class SafetyState:
-    """State of all checks between two steps."""
+    """State of all checks between two steps; with the lung alone, before the first, at rest."""
 
     lung: Lung  #: label of the mounted lung.
     #: when each condition that holds began to hold, s.
@@ -134,17 +134,12 @@ class SafetyState:
     closed_pressure: float = math.nan  #: pressure then, cmH2O.
 
 
-def init(lung: Lung) -> SafetyState:
-    """State before the first sample, for a lung at rest."""
-    return SafetyState(lung)
-
-
 def step(settings: SafetySettings, state: SafetyState, sample: SafetySample) -> SafetyState:
     """Look at one sample; one without a reading neither ends nor begins what the last one showed.
 
     Args:
         settings: all thresholds.
-        state: state from :func:`init` or from the step before.
+        state: of a lung at rest, or of the step before.
         sample: the sample; its time is not before that of the sample before.
 
     Returns:
@@ -198,16 +193,14 @@ def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
     dt = max(sample.time - before.time, 0.0)
     C, R = state.lung.C, state.lung.R
     valve = VALVE_GAIN * sample.u_in * dt  # mL
-    measured = sample.flow * dt if math.isfinite(sample.flow) else math.nan
+    given = sample.flow * dt if math.isfinite(sample.flow) else valve
     if sample.u_out:
         gone = math.exp(-dt / (1e-3 * C * (R + _OUTLET_RESISTANCE)))
         volume = state.volume * gone
     else:
-        volume = state.volume + (measured if math.isfinite(measured) else valve)
+        volume = state.volume + given
     begins = before.u_out == 1 and sample.u_out == 0
-    delivered = (0.0 if begins or sample.u_out else state.delivered) + (
-        0.0 if sample.u_out else valve
-    )
+    delivered = 0.0 if sample.u_out else valve + (0.0 if begins else state.delivered)
     switches = before.u_out != sample.u_out
     same = sample.pressure == before.pressure
     resistive = 1e-3 * R * VALVE_GAIN * abs(sample.u_in - before.u_in)
@@ -215,9 +208,8 @@ def _estimated(state: SafetyState, sample: SafetySample) -> SafetyState:
     # Behind an open expiratory valve the airway shows PEEP, whatever the lung still holds.
     expected = state.expected + (0.0 if sample.u_out else abs(elastic) + resistive)
     shut = sample.u_in <= 0.0 and sample.u_out == 0
-    closed = (
-        state.closed if shut and not math.isnan(state.closed) else sample.time if shut else math.nan
-    )
+    since = sample.time if math.isnan(state.closed) else state.closed
+    closed = since if shut else math.nan
     return replace(
         state,
         volume=volume,

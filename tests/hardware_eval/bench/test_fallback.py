@@ -54,7 +54,7 @@ def test_no_rig_within_the_bounds_exceeds_what_is_reachable(seed: int) -> None:
     nearest = np.inf
     for _ in range(25):
         label = LUNGS[draw.integers(len(LUNGS))]
-        rig, state = Rig(label, draw), fallback.init(label)
+        rig, state = Rig(label, draw), fallback.FallbackState(label)
         pressure, pip = protocol.PEEP, float(draw.uniform(10.0, 35.0))
         for step in range(int(draw.integers(1, 12))):
             answer = float(draw.uniform(0.0, 40.0))
@@ -75,7 +75,7 @@ def test_no_rig_within_the_bounds_exceeds_what_is_reachable(seed: int) -> None:
 def test_whatever_an_entry_asks_for_the_gate_holds(lung: Lung) -> None:
     for seed in range(6):
         draw = np.random.default_rng(seed)
-        rig, state, pip = Rig(lung, draw), fallback.init(lung), 15.0
+        rig, state, pip = Rig(lung, draw), fallback.FallbackState(lung), 15.0
         pressure, above = protocol.PEEP, 0
         for step in range(protocol.INSPIRATION_STEPS):
             answer = None if draw.random() < 0.3 else float(draw.choice([0.0, 50.0, 100.0]))

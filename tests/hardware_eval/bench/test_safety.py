@@ -45,7 +45,7 @@ def healthy(breaths: int = 2, pip: float = 20.0) -> Iterator[SafetySample]:
 
 def looked_at(change: Callable[[int, SafetySample], SafetySample]) -> SafetyState:
     """State after the healthy breaths with a change, until the first trip."""
-    state = safety.init(LUNG)
+    state = SafetyState(LUNG)
     for index, sample in enumerate(healthy()):
         state = safety.step(DEFAULT, state, change(index, sample))
         if state.trips:
@@ -129,7 +129,7 @@ def test_missing_readings_hide_no_fault_and_raise_no_alarm(
 def test_over_pressure_is_the_gate_of_scoring(readings: list[float], inspired: int) -> None:
     # A breath so far trips the check as soon as scoring would refuse it. The
     # expiration counts, and a breath before it does not.
-    pip, state = 10.0, safety.init(LUNG)
+    pip, state = 10.0, SafetyState(LUNG)
     before = [SafetySample(k * DT, 26.0, math.nan, 0.0, 1, pip, 0.0, 0.0) for k in (0, 1)]
     for k, pressure in enumerate([9.0, *readings]):
         u_out = int(k == 0 or k > inspired)
@@ -160,7 +160,7 @@ def test_a_jump_that_no_valve_can_make_trips() -> None:
 
 
 def test_pressure_that_rises_behind_closed_valves_trips() -> None:
-    state = safety.init(LUNG)
+    state = SafetyState(LUNG)
     for index in range(20):
         sample = SafetySample(index * DT, 5.0 + 1.2 * index, math.nan, 0.0, 0, 35.0, 0.0, 0.0)
         state = safety.step(DEFAULT, state, sample)
@@ -168,7 +168,7 @@ def test_pressure_that_rises_behind_closed_valves_trips() -> None:
 
 
 def test_a_reading_that_stands_still_at_rest_trips_after_five_seconds() -> None:
-    state = safety.init(LUNG)
+    state = SafetyState(LUNG)
     for index in range(180):
         sample = SafetySample(index * DT, 5.0, math.nan, 0.0, 1, 20.0, 0.0, 0.0)
         state = safety.step(DEFAULT, state, sample)

@@ -148,7 +148,7 @@ def run(
     reason = masked.hidden(done.reason)
     emit(
         {
-            "complete": done.complete and not done.stopped,
+            "complete": not (reason or done.stopped),
             "reason": reason,
             "log": str(done.log),
             "recording": None if done.recording is None else str(done.recording),
@@ -158,7 +158,7 @@ def run(
         json,
     )
     shown = told(json)
-    if not done.complete:
+    if reason:
         print(f"stopped: {plain(reason)}; {line.client.ending()}", file=shown)
         print(f"what is done is in {done.log}; the same command continues", file=shown)
         raise typer.Exit(1)

@@ -410,7 +410,7 @@ def errors_on(
         sandbox=sandbox,
         operator_name="ventbench-hardware demo",
     )
-    if not done.complete:
+    if done.reason:
         raise InputError(f"{entry.name} did not finish its plan: {done.reason}")
     scored = read_session(done.log).of_type("run", kind="scored", status="complete")
     return dict.fromkeys(pips, float("inf")) | {line["pip"]: line["error"] for line in scored}

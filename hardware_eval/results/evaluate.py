@@ -49,8 +49,7 @@ if TYPE_CHECKING:
 class Evaluation:
     """What an evaluation made."""
 
-    complete: bool  #: whether the plan is done.
-    reason: str  #: why not; empty if it is.
+    reason: str  #: why the plan is not done; empty if it is.
     log: Path  #: the raw recording.
     #: all whole breaths of an undisturbed tube in the public schema; None if there is none.
     recording: Path | None
@@ -367,7 +366,7 @@ def evaluate(
     with contextlib.suppress(InputError):  # without jinja2, or a complete run
         page.write(out)
         acceptance.write(out)
-    return Evaluation(not reason, reason, log_path, written, made, stopped, frozenset(unrun))
+    return Evaluation(reason, log_path, written, made, stopped, frozenset(unrun))
 
 
 @contextlib.contextmanager

@@ -100,13 +100,8 @@ def load(client: Client) -> dict[str, Any]:
     dated.check_age(found["date"], "the bring-up of this device", REMEDY)
     if found.get("go") is not True:
         raise InputError(f"{path}: the bring-up was not confirmed. Run `{REMEDY}`")
-    _allow(client)
+    client.brought_up = device
     return found
-
-
-def _allow(client: Client) -> None:
-    assert client.welcome is not None
-    client.brought_up = client.welcome.device
 
 
 def bring_up(bench: Bench) -> list[Finding]:
@@ -131,7 +126,7 @@ def bring_up(bench: Bench) -> list[Finding]:
             break
     client.hello()
     if is_confirmed(findings):
-        _allow(client)
+        client.brought_up = dated.device_of(client)
     return findings
 
 
@@ -141,7 +136,7 @@ def look(bench: Bench, step: str) -> list[Finding]:
         return _room(bench)
     if step == "reference":
         return _reference(bench)
-    _allow(bench.client)
+    bench.client.brought_up = dated.device_of(bench.client)
     try:
         return _vent(bench) if step == "vent" else _clicked(bench, step)
     finally:

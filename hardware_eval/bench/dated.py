@@ -23,8 +23,7 @@ STALE = 30.0
 
 def device_of(client: Client) -> dict[str, str]:
     """What a device says that it is: its number, and the hash of wiring and calibration."""
-    welcome = client.welcome or client.hello()
-    return {"device_id": welcome.device_id.hex(), "calibration": welcome.calibration.hex()}
+    return (client.welcome or client.hello()).device
 
 
 def today() -> datetime.datetime:

@@ -336,8 +336,8 @@ class Client:
         welcome: what the device told at the last :meth:`hello`; None before.
         reading: the newest reading; None before the first.
         vented: whether the last answer was of a device that has vented.
-        brought_up: device and calibration, as ``(device_id, calibration)``, that a person has
-            confirmed (:mod:`hardware_eval.bench.bringup`); without it no real device is armed.
+        brought_up: device and calibration that a person has confirmed
+            (:mod:`hardware_eval.bench.bringup`); without it no real device is armed.
     """
 
     def __init__(
@@ -352,7 +352,7 @@ class Client:
         The latter needs its own clock. An answer may take ``timeout``, s. Only at a port where
         software may be (``emulated``) a device is believed that says it is simulated.
         """
-        self.brought_up: tuple[bytes, bytes] | None = None
+        self.brought_up: dict[str, str] | None = None
         self._emulated = emulated
         self.welcome: Welcome | None = None
         self.reading: Reading | None = None

@@ -189,9 +189,9 @@ class Welcome:
     name: str  #: what people call the device, at most 32 bytes of UTF-8.
 
     @property
-    def device(self) -> tuple[bytes, bytes]:
-        """Which device it is, wired and calibrated as it is."""
-        return self.device_id, self.calibration
+    def device(self) -> dict[str, str]:
+        """Which device it is, wired and calibrated as it is; hexadecimal, as in files."""
+        return {"device_id": self.device_id.hex(), "calibration": self.calibration.hex()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,11 +108,6 @@ class Sheet:
         """Whether everything is within its limits."""
         return all(finding.ok for finding in self.findings)
 
-    @property
-    def nearest(self) -> str:
-        """The lung whose simulator fits the probes best; empty if there were none."""
-        return min(self.errors, key=lambda lung: self.errors[lung], default="")
-
     def problems(self) -> list[str]:
         """What is not within its limits, in words."""
         return [f"{x.name.replace('_', ' ')}: {x.text}" for x in self.findings if not x.ok]
@@ -123,7 +118,6 @@ class Sheet:
             "lung": self.lung,
             "go": self.go,
             "skipped": list(self.skipped),
-            "nearest": self.nearest,
             "R": _number(self.R),
             "C": _number(self.C),
             "errors": {lung: _number(error) for lung, error in self.errors.items()},

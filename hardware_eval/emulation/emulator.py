@@ -65,11 +65,7 @@ class LoopbackDevice:
     def turn(self, now: float, data: bytes) -> None:
         """Step the device's program, and answer."""
         if answers := self.service.step(now, data):
-            self.answer(now, answers)
-
-    def answer(self, now: float, data: bytes) -> None:
-        """Put bytes of the device on the way to the host."""
-        self._outgoing.append((now + self.latency, data))
+            self._outgoing.append((now + self.latency, answers))
 
     def close(self) -> None:
         """Nothing to release; the device goes on."""

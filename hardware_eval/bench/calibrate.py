@@ -345,8 +345,8 @@ class Calibration:
     def valve(self) -> Valve | None:
         """Curve of the valve, through the means of both directions; None if not calibrated.
 
-        Its error is that of the readings and their scatter about the curve, none of which is taken
-        to average out: a meter is off by the same share everywhere.
+        Its error is that of the readings, as a meter is off by the same share everywhere; what the
+        directions are apart is each opening's own. Neither is taken to average out.
         """
         if (part := self.parts.get("valve")) is None:
             return None
@@ -355,8 +355,8 @@ class Calibration:
         openings = np.unique(opening)
         means = np.array([flow[opening == x].mean() for x in openings])
         near = np.interp(opening, openings, means)
-        share = float(np.sqrt(np.mean((error**2 + (flow - near) ** 2) / near**2)))
-        return Valve(tuple(openings.tolist()), tuple(means.tolist()), share)
+        shares = np.sqrt(np.mean(np.square([error, flow - near] / near), axis=1))
+        return Valve(tuple(openings.tolist()), tuple(means.tolist()), *shares.tolist())
 
     def _line(self, kind: str) -> Fit:
         """The line of a part; of one that was not calibrated, that of a right one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -38,8 +38,9 @@ _REFUSED, _FAR = 0.05, 13.8
 #: through it.
 _CLOSING = 4
 
-#: Times by which a flow may follow its command, s, and half of that in which a valve moves evenly.
-_LATE, _MOVES = np.arange(10) * 0.01, 0.01
+#: Times by which a flow may follow its command, s, as close as a fit can tell them apart; and half
+#: of that in which a valve moves evenly.
+_LATE, _MOVES = np.arange(46) * 0.002, 0.01
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,7 @@ class Valve:
     openings: tuple[float, ...]  #: %, upwards.
     flows: tuple[float, ...]  #: mL/s.
     error: float  #: standard error of all flows together, as a share.
+    scatter: float = 0.0  #: standard deviation of each flow by itself, as a share.
 
     def flow(self, u_in: Floats) -> Floats:
         """Flows at openings ``(n,)``, %, mL/s; the last line goes on."""
@@ -127,10 +129,12 @@ def identified(probes: Sequence[Driven], lung: str, valve: Valve | None) -> tupl
     """Judge a label by R and C, among all settings of a test lung.
 
     The pressure alone tells ``R g`` and ``C / g`` for a valve of gain g: whatever g is, R C. The
-    calibrated curve tells g, but for its error, which moves R and 1/C of a setting together; where
-    a flow is measured, nothing does. Each setting is a normal distribution of R and 1/C, as rigs
-    lie about their label, and of K, any share of R. Its likelihood is the mean over the times by
-    which the flow may be late, each with the distribution of its fit.
+    calibrated curve tells g, but for the meter's error, which moves R and 1/C of a setting
+    together; where a flow is measured, nothing does. A flow of the curve that is off by itself
+    bends the curve, and moves R, K and 1/C each in its own way: as the same fit with it says. Each
+    setting is a normal distribution of R and 1/C, as rigs lie about their label, and of K, any
+    share of R. Its likelihood is the mean over the times by which the flow may be late, each with
+    the distribution of its fit.
 
     Args:
         probes: whole breaths.
@@ -147,7 +151,11 @@ def identified(probes: Sequence[Driven], lung: str, valve: Valve | None) -> tupl
     if valve is None:
         return None, "unknown: the device measures no flow and the valve is not calibrated"
     coefficients, inverses, squares, variance = fitted(probes, valve)
-    covariances, beyond = variance * inverses, squares - squares.min()
+    # One of the curve's flows after another is off by its scatter.
+    curves = np.array(valve.flows) * (1.0 + valve.scatter * np.eye(len(valve.flows)))
+    moved = [fitted(probes, replace(valve, flows=tuple(x)))[0] - coefficients for x in curves]
+    covariances = variance * inverses + np.einsum("jmk,jml->mkl", moved, moved)
+    beyond = squares - squares.min()
     weights = np.exp(-0.5 * beyond)
     weights /= weights.sum()
     R, _, elastance = mean = weights @ coefficients
@@ -195,6 +203,7 @@ class KnownLung:
     lung: str  #: its label.
     logarithms: tuple[float, ...]  #: of R, cmH2O/(L/s), and 1/C, cmH2O/L.
     errors: tuple[float, ...]  #: their standard errors, by the noise of the sensor.
+    correlation: float = 0.0  #: of these errors; by the same probes always the same.
 
 
 @dataclass(frozen=True)
@@ -222,12 +231,13 @@ def measured_lung(
     """
     (first, *_), (inverse, *_), *_ = fitted(probes, terms=2)
     R, elastance, values = *first, np.where(first > 0.0, first, math.nan)
-    errors = noise * np.sqrt(np.diag(inverse)) / values
+    of_one = np.sqrt(np.diag(inverse))
+    errors, together = noise * of_one / values, inverse[0, 1] / of_one.prod()
     gain = 1e-3 * parse_lung(lung).C * elastance
     if is_measured(probes):
         gains = [np.maximum(x.flow, 0.0).sum() / max(x.u_in.sum(), 1e-9) for x in probes]
         gain = float(np.mean(gains)) / VALVE_GAIN
-    known = KnownLung(lung, tuple(np.log(values).tolist()), tuple(errors.tolist()))
+    known = KnownLung(lung, tuple(np.log(values).tolist()), tuple(errors.tolist()), together)
     return known, R, 1e3 / max(elastance, 1e-9), gain
 
 

@@ -434,16 +434,21 @@ def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:
 
 
 def span_finding(found: KnownLung, known: KnownLung | None) -> Finding:
-    """Compare a lung with itself: the span of the pressure scales R and 1/C alike."""
+    """Compare a lung with itself: the span of the pressure scales R and 1/C alike.
+
+    The noise moves both of a fit together, so that the least certain mean of their changes weighs
+    them by the inverse of their covariance.
+    """
     if known is None or known.lung != found.lung:
         return Finding("sensor_span", math.nan, True, "unknown: this lung was not calibrated")
     apart = np.subtract(found.logarithms, known.logarithms)
-    weights = 1.0 / (np.square(found.errors) + np.square(known.errors))
-    use = np.isfinite(apart) & np.isfinite(weights)
+    together = np.array([[1.0, found.correlation], [found.correlation, 1.0]])
+    covariance = together * sum(np.outer(x.errors, x.errors) for x in (found, known))
+    use = np.isfinite(apart) & np.isfinite(np.diag(covariance))
     if not use.any():
         return unknown("sensor_span", "neither R nor C could be measured")
-    change = float(np.average(apart[use], weights=weights[use]))
-    error = float(np.sum(weights[use])) ** -0.5
+    weights = np.linalg.inv(covariance[np.ix_(use, use)]).sum(axis=0)
+    change, error = float(np.average(apart[use], weights=weights)), float(weights.sum()) ** -0.5
     beyond = abs(change) - _SIGMAS * error > math.log(LIMITS["sensor_span"].high)
     told = f"R and 1/C are {math.exp(change):.3f} (SE {error:.3f}) of those calibrated"
     told += ": calibrate sensor and flow, or is it another lung?" if beyond else ""

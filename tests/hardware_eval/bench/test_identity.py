@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,15 +22,22 @@ FINE, OUTLET = 30, 4.0
 
 
 def probed(
-    R: float, C: float, parabolic: bool, noise: float, seed: int, valve: Valve = NOMINAL
+    R: float,
+    C: float,
+    parabolic: bool,
+    noise: float,
+    seed: int,
+    valve: Valve = NOMINAL,
+    slow: float = 0.0,
 ) -> list[Driven]:
     """The self-test's probes on a lung, by Euler's method; flow and pressure at each step.
 
-    A parabolic resistor has its label's R at 1 L/s.
+    A parabolic resistor has its label's R at 1 L/s. Of the flow so much is still that of the
+    command before, which also a slow valve gives.
     """
     draw, done = np.random.default_rng(seed), []
     for program in programs(f"R{R:g}C{C:g}")["lung"]:
-        volume, rows, u_in, u_out = 0.0, [], 0.0, 1
+        volume, rows, u_in, u_out, before = 0.0, [], 0.0, 1, 0.0
         for step in range(program.steps):
             for _ in range(FINE):
                 elastic = volume / C
@@ -37,13 +45,16 @@ def probed(
                     flow = -1000.0 * elastic / (R + OUTLET)
                     pressure = 5.0 - 1e-3 * OUTLET * flow
                 else:
-                    flow = float(valve.flow(np.array([u_in]))[0])
+                    flow = float(
+                        np.array([1.0 - slow, slow]) @ valve.flow(np.array([u_in, before]))
+                    )
                     through = 1e-3 * flow
                     drop = R * (through**2 if parabolic else through)
                     pressure = 5.0 + elastic + drop
                 volume += flow * protocol.DT / FINE
             read = pressure + noise * draw.standard_normal()
             rows.append((0.03 * step, read, flow, u_in, u_out, 0.0, 0.0))
+            before = u_in
             u_in, u_out = program.commands(step, read)
             u_in = min(u_in, 100.0)
         done.append(Driven(*np.array(rows, float).T, (), False, 0))  # type: ignore[arg-type]
@@ -119,3 +130,28 @@ def test_without_flow_a_gain_that_is_not_known_leaves_R_C() -> None:
         assert told.endswith("without a flow sensor")
     assert identified(probes, "R5C10", unsure)[0] is False
     assert identified(probes, "R50C20", NOMINAL)[0] is False
+
+
+def told_R(told: str) -> tuple[float, float]:
+    """R and half of its interval, of what a person reads."""
+    value, half = re.findall(r"R (.*?) \(\+-(.*?)\)", told)[0]
+    return float(value), float(half)
+
+
+@pytest.mark.parametrize("slow", [0.15, 0.25])
+def test_the_delay_of_a_valve_is_none_of_R(slow: float) -> None:
+    """The third probe rings on a lung of R 50, where a delay that is 2 ms off is much of R."""
+    probes = blind(probed(50.0, 50.0, False, 0.1, seed=0, slow=slow))
+    holds, told = identified(probes, "R50C50", NOMINAL)
+    assert holds, told
+    assert told_R(told)[0] == pytest.approx(50.0, rel=0.3)
+
+
+@pytest.mark.parametrize("signs", [(1, 1, -1, -1, -1), (-1, -1, 1, 1, 1)])
+def test_a_curve_may_be_bent_by_its_scatter(signs: tuple[int, ...]) -> None:
+    bent = tuple(np.array(CURVED.flows) * (1.0 + 0.04 * np.array(signs)))
+    probes = blind(probed(20.0, 20.0, True, 0.1, seed=0, valve=replace(CURVED, flows=bent)))
+    holds, told = identified(probes, "R20C20", replace(CURVED, error=0.02, scatter=0.04))
+    assert holds, told
+    R, half = told_R(told)
+    assert abs(R - 20.0) < half

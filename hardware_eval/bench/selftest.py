@@ -436,15 +436,15 @@ def _errors(probes: list[Driven], simulator: Any) -> dict[str, float]:
 def span_finding(found: KnownLung, known: KnownLung | None) -> Finding:
     """Compare a lung with itself: the span of the pressure scales R and 1/C alike.
 
-    The noise moves both of a fit together, so that the least certain mean of their changes weighs
-    them by the inverse of their covariance.
+    The noise moves both of a fit together, so that the surest mean of their changes weighs them by
+    the inverse of their covariance.
     """
     if known is None or known.lung != found.lung:
         return Finding("sensor_span", math.nan, True, "unknown: this lung was not calibrated")
     apart = np.subtract(found.logarithms, known.logarithms)
     together = np.array([[1.0, found.correlation], [found.correlation, 1.0]])
     covariance = together * sum(np.outer(x.errors, x.errors) for x in (found, known))
-    use = np.isfinite(apart) & np.isfinite(np.diag(covariance))
+    use = np.isfinite(apart) & (np.diag(covariance) > 0.0)
     if not use.any():
         return unknown("sensor_span", "neither R nor C could be measured")
     weights = np.linalg.inv(covariance[np.ix_(use, use)]).sum(axis=0)

@@ -176,6 +176,8 @@ def test_a_span_that_is_off_shows_on_a_calibrated_lung(off: float) -> None:
     assert "calibrate sensor and flow" in finding.text
     assert span_finding(changed, replace(then, lung="R5C10")).ok  # another lung tells nothing
     assert span_finding(changed, None).ok
+    silent = replace(changed, errors=(0.0, 0.0))  # a sensor without noise tells no error
+    assert span_finding(silent, replace(then, errors=(0.0, 0.0))).text.startswith("neither")
 
 
 FAULTS = {

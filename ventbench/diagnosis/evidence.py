@@ -337,6 +337,7 @@ class _Search:
     def extend(self, chosen: Scored, noise: Noise) -> tuple[CandidateEffects, Noise]:
         """Fit sets with one term more, less or other, and return what they were chosen by."""
         around, names = self.around(chosen.fitted), names_of(chosen.terms)
+        leads = chosen is self.ordered()[0]
         model = self.linear_model(around, chosen.fitted, noise, chosen.terms, loose=True)
         noise = self.evaluator.colour(model.residual_noise)
         if len(names) < self.settings.most_terms:
@@ -347,7 +348,7 @@ class _Search:
         for term in chosen.terms:
             rest = tuple(t for t in chosen.terms if t is not term)
             self.attempt(around, noise, rest, chosen.fitted, new=True)
-            if term.name not in IN_TIME:
+            if term.name in basis_terms() or (leads and term.name not in IN_TIME):
                 self.swap(term.name, rest, noise)
             if term.name in EVENTS and names_of(rest) in self.scored:
                 # The breaths in which it acts, beside the rest.

@@ -65,7 +65,11 @@ class LoopbackDevice:
     def turn(self, now: float, data: bytes) -> None:
         """Step the device's program, and answer."""
         if answers := self.service.step(now, data):
-            self._outgoing.append((now + self.latency, answers))
+            self.answer(now, answers)
+
+    def answer(self, now: float, data: bytes) -> None:
+        """Put bytes of the device on the way to the host."""
+        self._outgoing.append((now + self.latency, data))
 
     def close(self) -> None:
         """Nothing to release; the device goes on."""

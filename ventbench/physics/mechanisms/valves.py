@@ -57,7 +57,7 @@ class CommandRounding(Mechanism):
             Parameter(
                 "step",
                 "%",
-                "distance of the positions; no derivative: a search compares all of its grid",
+                "distance between the positions of the valve",
                 0.1,
                 10.0,
                 1.0,

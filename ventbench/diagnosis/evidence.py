@@ -500,7 +500,7 @@ class _Search:
 
         What acts in time is taken from the readings before a second fit.
         """
-        if not terms or (new and names_of(terms) in self.scored):
+        if not terms or (new and self.is_scored(terms, start)):
             return
         fitted, reduced, latent = start, self.data, latent_of(terms)
         for k in range(2 if latent else 1):
@@ -518,6 +518,15 @@ class _Search:
         if before is None or _log_posterior(before) < _log_posterior(now):
             self.scored[names_of(terms)] = now
             self.contenders.add(names_of(terms))
+
+    def is_scored(self, terms: Set, start: FittedModel) -> bool:
+        """Whether a set was fitted, and not worse than what another fit would start it from."""
+        scored = self.scored.get(names_of(terms))
+        if scored is None:
+            return False
+        problem, minimum = scored.fitted.problem, scored.fitted.minimum
+        x = problem.start({path: start.column(path) for path in start.problem.unknowns.paths})
+        return bool(problem.cost(x) >= minimum.cost)
 
     def rescore(self, around: CandidateEffects, noise: Noise) -> None:
         """Score all sets alike, but for those that are far behind."""

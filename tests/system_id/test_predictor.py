@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +48,16 @@ AT = [(path, first) for path in LATE for first in (0.0, 0.041) if (path, first) 
 @pytest.fixture(scope="module")
 def data():
     return make_data(cases.recording(6, {}))
+
+
+@pytest.mark.parametrize(
+    ("ids", "positions"),
+    [([3, 4, 8], (0.0, 0.2, 1.0)), ([8, 3, 4], (0.0, 0.5, 1.0)), ([7], (0.0,))],
+    ids=["breaths left out", "ids that do not rise", "one breath"],
+)
+def test_breaths_that_were_left_out_keep_their_places(ids, positions):
+    breaths = replace(cases.recording(len(ids), {}), breath_id=np.array(ids))
+    assert make_data(breaths).position == pytest.approx(positions)
 
 
 @pytest.fixture(scope="module")

@@ -80,8 +80,9 @@ class Data:
 def make_data(breaths: Breaths, *, flow: bool = False) -> Data:
     """Make the data of a fit from a recording, with its flow if that is asked for.
 
-    Positions, the place of each breath in its recording, are evenly from 0 to 1. Breaths start at
-    rest.
+    Positions, the place of each breath in its recording, are from 0 to 1: as the ids of the breaths
+    are if these rise, so that breaths which were left out keep their places, else evenly. Breaths
+    start at rest.
 
     Raises:
         InputError: if there is no breath, no pressure or, when asked for, no flow.
@@ -97,7 +98,10 @@ def make_data(breaths: Breaths, *, flow: bool = False) -> Data:
         weight[:, 1, 0] = 0.0  # a breath starts at rest
     if not weight[:, 0].any():
         raise InputError("no pressure is measured in these breaths")
-    position = np.linspace(0.0, 1.0, len(breaths))
+    order = breaths.breath_id - breaths.breath_id[0]
+    if np.any(np.diff(order) < 0):
+        order = np.arange(len(breaths))
+    position = order / max(int(order[-1]), 1)
     names = ("u_in", "u_out", "dt", "R", "C")
     plain = {name: getattr(breaths, name).astype(float) for name in names}
     masked = np.where(weight > 0, measured, 0.0)

@@ -5,7 +5,7 @@ Its posterior is passed on, beside what held-out breaths accept of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -121,26 +121,28 @@ def hypotheses(
         unknown = dict.fromkeys(places, 1.0 / len(places))
     for place, weight in (unknown or {"": 1.0}).items():
         at = {f"unknown:{place}"} if place else set()
-        for names, probability in _swapped(named, found["mechanisms"]).items():
+        for names, probability in _swapped(named, found).items():
             add(names | at, (1.0 - shares.unsure) * shares.accepted * weight * probability)
     kept = sorted(odds.items(), key=lambda pair: -pair[1])[:_MOST]
     total = sum(probability for _, probability in kept)
     return [{"terms": sorted(terms), "probability": p / total} for terms, p in kept]
 
 
-def _swapped(
-    named: frozenset[str], mechanisms: Sequence[Mapping[str, Any]]
-) -> dict[frozenset[str], float]:
-    """Probabilities of the named set, and of those with a rival of one effect of some breaths.
+def _swapped(named: frozenset[str], found: Mapping[str, Any]) -> dict[frozenset[str], float]:
+    """Probabilities of the named set, and of those with a rival of one effect in its place.
 
-    Rivals of other names have their probability by the posterior of the search.
+    Held-out breaths accept what is named; they do not choose between it and its rivals.
     """
+    weights = {frozenset(each["terms"]): each["probability"] for each in found["posterior"]}
     odds = {named: 1.0}
-    for missing in mechanisms:
+    for missing in found["mechanisms"]:
         name, confidence, others = (missing[k] for k in ("name", "confidence", "alternatives"))
-        for other in others if missing["affected_breaths"] else ():
+        for other in others:
             swapped = named - {name} | {other}
-            odds[swapped] = odds.get(swapped, 0.0) + (1.0 / confidence - 1.0) / len(others)
+            if missing["affected_breaths"]:
+                odds[swapped] = odds.get(swapped, 0.0) + (1.0 / confidence - 1.0) / len(others)
+            elif named in weights:
+                odds[swapped] = weights.get(swapped, 0.0) / weights[named]
     total = sum(odds.values())
     return {names: each / total for names, each in odds.items()}
 

@@ -140,6 +140,20 @@ def test_a_rival_of_an_effect_of_some_breaths_has_its_share() -> None:
     assert terms("lost_commands", "valve_delay") not in answer  # its share is the posterior's
 
 
+def test_rivals_of_a_name_share_what_held_out_breaths_accept() -> None:
+    """Held-out breaths want one of two; which one, only the search has weighed."""
+    weighed = [
+        {"terms": list(each), "probability": probability}
+        for each, probability in (((), 0.9), (("gain_step",), 0.06), (("gain_drift",), 0.03))
+    ]
+    step = named("gain_step", 0.06, "gain_drift")
+    answer = told("named", mechanisms=[step], posterior=weighed)
+    accepted = (1.0 - CALIBRATION.unsure) * CALIBRATION.accepted
+    beside = (1.0 - CALIBRATION.unsure) * (1.0 - CALIBRATION.accepted) / 0.99
+    assert answer[terms("gain_step")] == pytest.approx(2.0 / 3.0 * accepted + 0.06 * beside)
+    assert answer[terms("gain_drift")] == pytest.approx(1.0 / 3.0 * accepted + 0.03 * beside)
+
+
 def test_an_effect_without_a_name_is_at_its_places() -> None:
     slot = {"name": "f(t) at the supply", "places": {"f(t) at the supply": 3.0, "f(Q)": 1.0}}
     where = told("unnamed", slot=slot, posterior=[{"terms": ["supply_memory"], "probability": 1}])

@@ -300,10 +300,13 @@ def test_what_acts_beside_efforts_is_judged_beside_them(names, nats, helps):
         pressures=lambda model, *_: model.hypothesis.names,
     )
     judge = SimpleNamespace(
-        log_likelihood=lambda names, _: {full.hypothesis.names: 5.0, **nats}[names]
+        log_likelihood=lambda names, *_: {full.hypothesis.names: 5.0, **nats}[names]
     )
     experiment: Any = SimpleNamespace(
-        judge=judge, data=None, breaths=SimpleNamespace(pressure=np.zeros((1, 1)))
+        judge=judge,
+        data=None,
+        breaths=SimpleNamespace(pressure=np.zeros((1, 1))),
+        uses=SimpleNamespace(share_aside=0.0),
     )
     for unchanged in (False, True):
         correction: Any = SimpleNamespace(unchanged=unchanged, helps=False)

@@ -171,9 +171,26 @@ def test_the_judge_answers_with_errors_of_its_breaths_alone():
     assert (error.mae, error.rmse) == pytest.approx((0.5, 0.5))
     assert judge.ids == tuple(breaths.breath_id[judging])
     noise = Noise((0.2,), (0.0,))
-    right, wrong = (judge.log_likelihood(breaths.pressure + x, noise) for x in (0.0, off))
+    right, wrong = (judge.log_likelihood(breaths.pressure + x, noise, 0.0) for x in (0.0, off))
     expected = (noise.loss(np.array(2.5)) - 0.0) * judging.sum() * SAMPLES
     assert right - wrong == pytest.approx(float(expected))
+
+
+def test_breaths_with_an_effect_that_nobody_predicts_do_not_outvote_the_others():
+    """A name that halves the error of five breaths, and misses an open circuit by more."""
+    breaths = recorded(nothing, 0)
+    judging, noise = np.arange(BREATHS) % 6 == 5, Noise((0.2,), (0.0,), tail=3.0)
+    judge, off = Judge(breaths, judging), np.full(BREATHS, 0.4)
+    off[np.flatnonzero(judging)[0]] = 40.0
+    better = np.where(off > 1.0, 120.0, 0.2)
+
+    def gain(share: float) -> float:
+        with_it, without = (
+            judge.log_likelihood(breaths.pressure + x[:, None], noise, share) for x in (better, off)
+        )
+        return with_it - without
+
+    assert gain(0.0) < 0.0 < gain(0.2)
 
 
 @pytest.mark.parametrize("n", [48, 16], ids=["apart", "few breaths, which test as well"])

@@ -11,7 +11,7 @@ import pytest
 
 from hardware_eval.emulation.cases import Base
 from proofs.challenge.faults.effects import FaultsCase
-from proofs.challenge.faults.laboratory import record
+from proofs.challenge.faults.laboratory import _OPEN_TUBE, record
 from ventbench.diagnosis.conclusion import Conclusion
 from ventbench.diagnosis.evaluator import Evaluator, fit_with_noise, make_evaluator
 from ventbench.diagnosis.evidence import COMMANDS, EVENTS, Posterior, search
@@ -85,7 +85,7 @@ def found(breaths: Breaths, **changed: Any) -> Intermittent | None:
         ("intermittent_leak", {"conductance": 15.0}, ("conductance", 15.0)),
         ("secretions", {"increase": 0.8}, ("increase", 0.8)),
         ("cough", {"pressure": 9.0}, None),
-        ("disconnection", {}, None),
+        ("disconnection", {}, ("conductance", _OPEN_TUBE)),
     ],
 )
 def test_an_effect_of_some_breaths_is_named_with_them(name, values, strength):
@@ -100,6 +100,14 @@ def test_an_effect_of_some_breaths_is_named_with_them(name, values, strength):
     if strength is not None:
         estimate = effect.missing.parameters[strength[0]]
         assert estimate.value == pytest.approx(strength[1], rel=0.2)
+
+
+def test_what_acts_in_no_held_out_breath_is_named_by_the_others():
+    few = np.array([4, 10])
+    assert not np.any((few - 1) % 3 == 1)
+    effect = found(session("disconnection", few))
+    assert effect is not None
+    assert (effect.missing.name, effect.missing.affected) == ("disconnection", (4, 10))
 
 
 def test_nothing_is_found_in_breaths_that_are_alike():

@@ -53,6 +53,15 @@ def test_events_are_no_mechanisms_of_the_library() -> None:
     [
         ({"secretions.increase": 0.5}, {"R": 30.0}),
         ({"intermittent_leak.conductance": 9.0}, {"m": {"leak": {"conductance": 9.0}}}),
+        (  # a jet out of an open end
+            {
+                "disconnection.conductance": 90.0,
+                "disconnection.exponent": 0.5,
+                "disconnection.onset": -1.0,
+                "disconnection.duration": 9.0,
+            },
+            {"m": {"leak": {"conductance": 90.0}}},
+        ),
         (
             {"cough.pressure": 6.0, "cough.onset": 0.3, "cough.duration": 0.4},
             {"m": {"patient_effort": {"amplitude": -6.0, "onset": 0.3, "duration": 0.4}}},

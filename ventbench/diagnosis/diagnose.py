@@ -59,7 +59,6 @@ from ventbench.diagnosis.simulator_comparison import (
     refit_at_simulator_parameters,
     refit_lungs,
 )
-from ventbench.diagnosis.unknown import explained, preference, unplaced_gain
 from ventbench.diagnosis.validation import check_residuals, detection_limits, explained_share
 from ventbench.mechanics.labels import LungMatch
 from ventbench.physics.catalogue import mechanism, parameter
@@ -163,11 +162,9 @@ def diagnose(
         excluded += (*flow_drive.ventilator_side(), *IN_TIME)
         settings = flow_drive.lung_side_settings(settings, breaths)
     intermittent: list[MissingMechanism] = []
-    posterior = None  # that of all breaths has all effects
     with compilation.one_blas_thread():
         while True:
             alone = _identify(experiment, excluded, tell, settings)
-            posterior = posterior or alone.conclusion.posterior
             if by_flow or len(intermittent) == _MOST_INTERMITTENT:
                 break
             tell("looking for effects of some breaths", _halfway(experiment))
@@ -183,10 +180,12 @@ def diagnose(
             diagnosis = behind.conclude(
                 _conclude(behind.sensed, alone, excluded, tell, settings), settings
             )
+    apart = {missing.name for missing in intermittent}
+    weights = alone.conclusion.posterior.weights
     return replace(
         diagnosis,
         verdict="named" if intermittent else diagnosis.verdict,
-        posterior=likeliest_sets(posterior.weights),
+        posterior=likeliest_sets({names | apart: weight for names, weight in weights.items()}),
         mechanisms=(*intermittent, *diagnosis.mechanisms),
         simulator=_name(simulator, simulators),
         seconds=time.perf_counter() - began,
@@ -241,24 +240,13 @@ def _set_aside_effect(
     some = find(model, experiment.identification_data, experiment.breaths.breath_id[identifying])
     if some is None:
         return None
-    evaluator, full, nats = model.evaluator, model.conclusion.full, some.missing.nats
-    ahead = nats - unplaced_gain(evaluator, full, evaluator.held_out)
-    if ahead <= 0.0:
-        return None
-    worth, share = explained(evaluator, full, evaluator.held_out, nats)
-    missing = replace(
-        some.missing,
-        confidence=some.missing.confidence * preference(ahead),
-        worth=worth,
-        explains=share,
-    )
     affected, u_in = np.zeros(len(identifying), bool), None
     affected[identifying] = some.affected
     if some.u_in is not None:
         u_in = experiment.reached.copy()
         u_in[identifying] = some.u_in
     reduced = experiment.set_aside(affected, u_in)
-    return None if reduced is None else (reduced, missing)
+    return None if reduced is None else (reduced, some.missing)
 
 
 def _compare(
@@ -529,7 +517,9 @@ def _helps(
     first = experiment.breaths.pressure[:, 0]
     nats_full, nats_base = (
         experiment.judge.log_likelihood(
-            recording_model.pressures(model, experiment.data, first), full.noise
+            recording_model.pressures(model, experiment.data, first),
+            full.noise,
+            experiment.uses.share_aside,
         )
         for model in (full, base)
     )

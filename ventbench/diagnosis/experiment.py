@@ -41,6 +41,10 @@ _NOTE_ON_FLOW = (
 )
 
 
+#: Multiples of the noise by which a breath may err in which an effect acts that nobody predicts.
+_ROUGH = (4.0, 16.0, 64.0, 256.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Split:
     """Use of n breaths; masks ``(n,)``."""
@@ -62,6 +66,11 @@ class Split:
     def fitted(self) -> Bools:
         """Breaths of the final fits: all that do not judge."""
         return ~self.judging & ~self.aside
+
+    @property
+    def share_aside(self) -> float:
+        """Share of the breaths of the fits that an effect of some breaths has set aside."""
+        return float(self.aside[~self.judging].mean())
 
     @property
     def sealed(self) -> Bools:
@@ -203,11 +212,23 @@ class Judge:
         error = error - np.einsum("ntk,nk->nt", nuisance, amplitudes(error, usable, nuisance))
         return excess_over_noise(error, usable, quiet[self.judging])
 
-    def log_likelihood(self, predicted: Floats, noise: Noise) -> float:
-        """Log-likelihood of predictions, nats."""
+    def log_likelihood(self, predicted: Floats, noise: Noise, share: float) -> float:
+        """Log-likelihood of predictions, nats.
+
+        Args:
+            predicted: predictions, cmH2O, ``(n, T)``.
+            noise: measurement noise.
+            share: of the breaths in which an effect acts that nobody predicts: these err more.
+        """
         error = (predicted - self._recorded)[self.judging][:, None]
         weight = np.isfinite(error).astype(float)
-        return float(noise.log_likelihood(np.nan_to_num(error), weight).sum())
+        error, count = np.nan_to_num(error), weight.sum(axis=(1, 2))
+        nats = noise.log_likelihood(error, weight)
+        if share > 0.0:
+            rough = [noise.log_likelihood(error / k, weight) - count * np.log(k) for k in _ROUGH]
+            affected = np.logaddexp.reduce(rough, axis=0) - np.log(len(_ROUGH))
+            nats = np.logaddexp(np.log1p(-share) + nats, np.log(share) + affected)
+        return float(nats.sum())
 
 
 def seal(breaths: Breaths, uses: Split) -> tuple[Breaths, Judge]:

@@ -35,13 +35,13 @@ from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
 from ventbench.diagnosis.identification import IdentifiedModel
 from ventbench.diagnosis.in_time import EXCHANGEABLE, Paths, command_p_value, follow
-from ventbench.diagnosis.unknown import mixture
+from ventbench.diagnosis.unknown import explained, mixture, preference, unplaced_gain
 from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
 from ventbench.physics.catalogue import mechanism
 from ventbench.system_id.data import Data
 from ventbench.system_id.predictor import START
-from ventbench.system_id.problem import Problem
+from ventbench.system_id.problem import Problem, make_problem
 
 #: Shares of the breaths that are tried; more than half of the breaths is not "some".
 _SHARES = np.array([0.03, 0.08, 0.15, 0.25, 0.4, 0.6])
@@ -53,8 +53,8 @@ _SPREAD = 0.3
 #: change of a start, cmH2O, at which that of commands and starts ends.
 _MULTIPLES, _ROUNDS, _SETTLED = np.geomspace(0.6, 1.0 / 0.6, 9), 4, 0.02
 
-#: Fewest breaths that must be affected, and must not be.
-_FEWEST, _MIN_UNAFFECTED = 2, 4
+#: Fewest breaths that must not be affected.
+_MIN_UNAFFECTED = 4
 
 #: p-value below which affected breaths have an order in time.
 _ORDERED = 0.002
@@ -66,8 +66,10 @@ _LAGS, _RARE, _TIE = (2, 3, 4, 5), 0.003, 2.0
 #: Nats within which another effect is an alternative; a posterior probability of 1 : 150.
 _CLOSE = 5.0
 
-#: Steps between the points of a grid, as shares of its own, by which a breath's course is refined.
-_FINER = (0.5, 0.25)
+#: Steps between the points of a grid, as shares of its own, by which a breath's course and strength
+#: are refined. Each halves the cell of the likeliest point in all of its dimensions.
+_MOVES = (-1.0, 0.0, 1.0)
+_FINER = (0.5, 0.25, 0.125, 0.0625)
 
 #: Multiples of the noise by which an affected breath may err, as the form of an effect is not
 #: known; a breath may err more than others without any.
@@ -96,13 +98,14 @@ class _EventFit(NamedTuple):
     fitted: FittedModel  #: the model of the breaths without it.
     strength: int  #: index of the strength; samples by which commands are late, 0 if they are lost.
     share: float  #: share of the breaths, or of the commands.
-    training: float  #: log-likelihood of all training breaths, nats.
+    #: log-likelihood of each training breath by what the others say of the effect, ``(n,)``.
+    left_out: Floats
     held_out: Floats  #: log-likelihood of each held-out breath, ``(h,)``.
 
     @property
     def total(self) -> float:
         """Log-likelihood of training and held-out breaths, nats."""
-        return self.training + float(self.held_out.sum())
+        return float(self.left_out.sum() + self.held_out.sum())
 
 
 def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermittent | None:
@@ -117,7 +120,8 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     hypothesis, likely = conclusion.named.hypothesis, conclusion.posterior.likely_events
     if not likely:
         return None
-    alone = fit_with_noise(evaluator, hypothesis.minus(*hypothesis.breath_terms))
+    rest = hypothesis.minus(*hypothesis.breath_terms)
+    alone = fit_with_noise(evaluator, rest, conclusion.named)  # which has the place of a change
     names = [name for name in likely if name not in COMMANDS]
     candidates = [
         candidate for name in names if (candidate := _fit(evaluator, alone, name)) is not None
@@ -125,27 +129,37 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     if len(names) < len(likely):
         candidates += _fit_commands(evaluator, alone)
     candidates.sort(key=lambda candidate: -candidate.total)
-    gained = candidates[0].held_out - _log_likelihood(model) if candidates else np.zeros(1)
-    if float(gained.sum()) <= _least(evaluator):
+    if not candidates:
         return None
-    best = candidates[0]
+    best, full = candidates[0], conclusion.full
+    swing = None if conclusion.unnamed is None else conclusion.unnamed.swing
+    if swing is None:  # what acts in few breaths may act in none of the held-out ones
+        tested, total = _joined(evaluator, evaluator.training, evaluator.held_out), best.total
+        gained = total - float(evaluator.log_likelihood(full, tested).sum())
+    else:
+        tested, total = evaluator.held_out, float(best.held_out.sum())
+        gained = total - float(swing.held_out_log_likelihood.sum())
+    unplaced = float(evaluator.log_likelihood(alone, tested).sum())
+    unplaced += unplaced_gain(evaluator, alone, tested)
+    if gained <= evaluator.settings.search.course_nats or total <= unplaced:
+        return None
     odds: dict[str, float] = {}
     for candidate in candidates:
         odds[candidate.name] = odds.get(candidate.name, 0.0) + float(
             np.exp(candidate.total - best.total)
         )
     affected, u_in, estimates = _everywhere(best, data)
-    if affected.sum() < _FEWEST or (u_in is None and _is_change(affected, evaluator, data)):
+    if not affected.any():
         return None
-    if u_in is None and _is_commanded(best):
-        return None
-    least_odds = np.exp(-_CLOSE)
+    least_odds, (worth, share) = np.exp(-_CLOSE), explained(evaluator, full, tested, gained)
     missing = MissingMechanism(
         best.name,
         estimates,
-        odds[best.name] / sum(odds.values()),
+        odds[best.name] / sum(odds.values()) * preference(total - unplaced),
         tuple(name for name, value in odds.items() if value > least_odds and name != best.name),
-        float(gained.sum()),
+        gained,
+        worth=worth,
+        explains=share,
         affected=tuple(int(i) for i in ids[affected]),
     )
     return Intermittent(missing, affected, u_in)
@@ -159,28 +173,11 @@ def _is_change(affected: Bools, evaluator: Evaluator, data: Data) -> bool:
     return order_p_value(ranked, data.lung, evaluator.settings.residuals) < _ORDERED
 
 
-def _is_commanded(candidate: _EventFit) -> bool:
-    """Whether commands predict in which breaths an effect acts."""
-    evaluator = candidate.evaluator
-    both = evaluator.partition(_joined(evaluator.training.data, evaluator.held_out.data))
-    evidence = _Evidence.of(evaluator, candidate.fitted, both, candidate.name)
-    likely = evidence.chances(candidate.strength, candidate.share)
-    pressure = evaluator.predict(candidate.fitted, both)[:, 0]
-    return command_p_value(likely, both.data, pressure) <= EXCHANGEABLE
-
-
-def _joined(first: Data, second: Data) -> Data:
+def _joined(evaluator: Evaluator, first: Partition, second: Partition) -> Partition:
     """The breaths of both."""
-    pairs = zip(vars(first).items(), vars(second).values(), strict=True)
-    return Data(**{name: np.concatenate([mine, theirs]) for (name, mine), theirs in pairs})
-
-
-def _log_likelihood(model: IdentifiedModel) -> Floats:
-    """Log-likelihood of the held-out breaths by all that was identified, nats, ``(h,)``."""
-    conclusion = model.conclusion
-    if conclusion.unnamed is not None and conclusion.unnamed.swing is not None:
-        return conclusion.unnamed.swing.held_out_log_likelihood
-    return model.evaluator.held_out_log_likelihood(conclusion.full)
+    pairs = zip(vars(first.data).items(), vars(second.data).values(), strict=True)
+    joined = {name: np.concatenate([mine, theirs]) for (name, mine), theirs in pairs}
+    return evaluator.partition(Data(**joined))
 
 
 def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _EventFit | None:
@@ -212,27 +209,18 @@ def _fit(evaluator: Evaluator, alone: FittedModel, name: str) -> _EventFit | Non
         fitted = fit_with_noise(
             now, alone.hypothesis, now.fit(alone.hypothesis, fitted.noise, start=start)
         )
-    gained, ahead = evidence.gains(strength, share)
-    nats = float((evidence.plain + gained).sum())
-    least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
-    if not affected.any() or nats < least or ahead < _least(evaluator):
+    left_out = evidence.plain + evidence.left_out()
+    if not affected.any():
         return None
     evidence = _Evidence.of(evaluator, fitted, evaluator.held_out, name)
-    gained, ahead = evidence.gains(strength, share)
-    if ahead < 0.0:
-        return None
-    return _EventFit(evaluator, name, fitted, strength, share, nats, evidence.plain + gained)
-
-
-def _least(evaluator: Evaluator) -> float:
-    """Log-likelihood that an effect must gain, nats: as much as any course in time."""
-    return evaluator.settings.search.course_nats
+    held_out = evidence.plain + mixture(share, evidence.acting()[strength])
+    return _EventFit(evaluator, name, fitted, strength, share, left_out, held_out)
 
 
 def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_EventFit]:
     """Lost and late commands beside a model of all training breaths."""
     training, fitted, share, candidates = evaluator.training, alone, float(_SHARES[1]), []
-    least = float(evaluator.log_likelihood(alone, training).sum()) + _least(evaluator)
+    least = float(evaluator.log_likelihood(alone, training).sum())
     for k in range(_ROUNDS):
         paths = _paths(evaluator, fitted, training, share, 0)
         share = float(np.clip(paths.missed.sum() / max(paths.sent.sum(), 1.0), _RARE, _SHARES[-1]))
@@ -246,12 +234,13 @@ def _fit_commands(evaluator: Evaluator, alone: FittedModel) -> list[_EventFit]:
         if not paths.missed.any() or before.noise == fitted.noise:
             break
     for lag in (0, *_LAGS):
-        total = float(_paths(evaluator, fitted, training, share, lag).nats.sum())
-        if total > least:
-            tested = _paths(evaluator, fitted, evaluator.held_out, share, lag).nats
-            name = COMMANDS[lag > 0]
-            total -= np.log(len(_LAGS)) if lag else 0.0  # each delay is as likely
-            candidates.append(_EventFit(evaluator, name, fitted, lag, share, total, tested))
+        nats, tested = (
+            _paths(evaluator, fitted, breaths, share, lag).nats
+            for breaths in (training, evaluator.held_out)
+        )
+        if lag:  # each delay is as likely
+            nats = nats - np.log(len(_LAGS)) / len(nats)
+        candidates.append(_EventFit(evaluator, COMMANDS[lag > 0], fitted, lag, share, nats, tested))
     return candidates
 
 
@@ -276,16 +265,22 @@ def _with_commands(evaluator: Evaluator, partition: Partition, paths: Paths) -> 
 def _from_first_readings(
     evaluator: Evaluator, fitted: FittedModel, partition: Partition
 ) -> tuple[Problem, Floats]:
-    """Breaths that start at their first readings: a start fitted without an effect mends it."""
-    problem, x = evaluator.refit_breath_parameters(fitted, partition)
-    x[problem.unknowns.of(START)] = problem.fixed[:, -1]
-    return problem, x
+    """Breaths that start at their first readings, with the gain of their lung.
+
+    A start or a gain that was fitted without an effect makes up for it.
+    """
+    fixed = evaluator.transferred(fitted, partition)
+    problem = make_problem(partition, (START,), fitted.noise, fixed, evaluator.gain_sd)
+    return problem, problem.start({})
 
 
 def _everywhere(
     candidate: _EventFit, data: Data
 ) -> tuple[Bools, Floats | None, dict[str, Estimate]]:
-    """In which of n breaths the effect acts, with which commands, and how strong it is."""
+    """In which of n breaths the effect acts, with which commands, and how strong it is.
+
+    In none if commands or the course of the session tell which: then it is another effect.
+    """
     evaluator, name = candidate.evaluator, candidate.name
     partition = evaluator.partition(data)
     if name in COMMANDS:
@@ -305,6 +300,11 @@ def _everywhere(
         return paths.missed > 0, paths.u_in, estimates
     evidence = _Evidence.of(evaluator, candidate.fitted, partition, name)
     acts = evidence.acts(candidate.strength, candidate.share)
+    likely = evidence.chances(candidate.strength, candidate.share)
+    pressure = evaluator.predict(candidate.fitted, partition)[:, 0]
+    commanded = command_p_value(likely, data, pressure) <= EXCHANGEABLE
+    if commanded or _is_change(acts, evaluator, data):
+        return np.zeros_like(acts), None, {}
     strength, centre = mechanism(name).description.strength, evidence.strengths[candidate.strength]
     if len(evidence.strengths) < 2 or not acts.any():
         return acts, None, {}
@@ -349,8 +349,10 @@ class _Evidence:
         linear = linearise(problem, x, clip=np.inf)
         strength, *secondary = mechanism(name).description.parameters
         strengths = strengths or strength.scan
-        names, grids = [p.name for p in secondary if p.grid], [p.grid for p in secondary if p.grid]
-        columns = [partition.predictor.names.index(f"{name}.{p}") for p in names]
+        scanned = np.array(strengths)
+        gridded = [p for p in secondary if p.grid]
+        grids = [p.grid for p in gridded]
+        columns = [partition.predictor.names.index(f"{name}.{p.name}") for p in gridded]
         strength_column = partition.predictor.names.index(f"{name}.{strength.name}")
         count = problem.data.weight.sum(axis=(1, 2))
 
@@ -368,8 +370,8 @@ class _Evidence:
         def gained(courses: Floats) -> Floats:
             """Gain ``(s, k, n)`` at each strength and k courses of each breath, (s, k, n, g)."""
             points = np.tile(linear.values, (*courses.shape[:2], 1, 1))
-            points[..., strength_column] = np.reshape(strengths, (-1, 1, 1))
-            points[..., columns] = courses
+            points[..., strength_column] = scanned[:, None, None] * np.exp(courses[..., -1])
+            points[..., columns] = courses[..., :-1]
             points, parts = points.reshape(-1, *linear.values.shape), []
             for k in range(0, len(points), _AT_ONCE):
                 predicted = partition.predictor.predict_all(points[k : k + _AT_ONCE])
@@ -379,21 +381,23 @@ class _Evidence:
                 parts.append((density(residuals, _ROUGH) - plain).T)
             return np.nan_to_num(np.concatenate(parts), nan=-np.inf).reshape(courses.shape[:3])
 
-        grid = np.array(list(product(*grids)))
-        shape = (len(strengths), len(grid), len(problem.data), len(grids))
+        grid = np.array(list(product(*grids, (0.0,))))
+        shape = (len(strengths), len(grid), len(problem.data), grid.shape[1])
         nats = gained(np.broadcast_to(grid[:, None], shape))
         best = np.argmax(nats, axis=1)[:, None]  # (s, 1, n)
         course, top = grid[best], np.take_along_axis(nats, best, axis=1)
-        for finer in _FINER if grids else ():  # between the points of the grid
-            step = np.stack(
-                [np.interp(course[..., k], g, np.gradient(g)) for k, g in enumerate(grids)], axis=-1
-            )
-            moves = np.array(list(product((-1.0, 0.0, 1.0), repeat=len(grids))))
+        moves = np.array(list(product(*((0.0,) if p.shape else _MOVES for p in gridded), _MOVES)))
+        apart = np.gradient(np.log(np.abs(scanned))) if len(strengths) > 1 else np.zeros(1)
+        volume = -np.log(len(moves)) / np.log(len(_MOVES)) * np.log(2.0)
+        for level, finer in enumerate(_FINER, 1):  # between the points of the grid, and of the scan
+            steps = [np.interp(course[..., k], g, np.gradient(g)) for k, g in enumerate(grids)]
+            step = np.stack([*steps, np.broadcast_to(apart[:, None, None], top.shape)], axis=-1)
             refined = course + finer * moves[:, None] * step  # (s, k, n, g)
             gains = gained(refined)
             chosen = np.argmax(gains, axis=1)[:, None]
             course = np.take_along_axis(refined, chosen[..., None], axis=1)
-            top = np.maximum(top, np.take_along_axis(gains, chosen, axis=1))
+            gains = np.take_along_axis(gains, chosen, axis=1)
+            top = np.logaddexp(top, gains + level * volume)  # a peak fills little of its cell
         np.put_along_axis(nats, best, top, axis=1)
         constant = problem.noise.log_scale(problem.data.weight) + count * problem.noise.log_norm()
         return cls(tuple(strengths), nats, rough, plain[:, 0] - constant)
@@ -413,10 +417,11 @@ class _Evidence:
         best = np.unravel_index(int(np.argmax(total)), total.shape)
         return int(best[1]), float(_SHARES[best[0]]), float(total.max())
 
-    def gains(self, strength: int, share: float) -> tuple[Floats, float]:
-        """Gain of each breath by the mixture, ``(n,)``, and how far that is ahead of rough ones."""
-        gained, rough = mixture(share, self.acting()[strength]), mixture(share, self.rough)
-        return gained, float(np.sum(gained - rough))
+    def left_out(self) -> Floats:
+        """Gain of each breath at the strength and the share that suit the others, ``(n,)``."""
+        gained = mixture(_SHARES[:, None, None], self.acting()[None]).reshape(-1, len(self.rough))
+        best = np.argmax(gained.sum(axis=1, keepdims=True) - gained, axis=0)
+        return gained[best, np.arange(len(best))]
 
     def chances(self, strength: int, share: float) -> Floats:
         """Posterior probability that the effect acts in each breath, ``(n,)``."""

@@ -154,9 +154,9 @@ def courses(name: str) -> list[dict[str, float]]:
     """Values of an event of some breaths, by path, for each of its courses."""
     if name in CONSTANT:
         return [{strength_path(name): CONSTANT[name][0]}]
-    _, onset, duration = mechanism(name).description.parameters
-    every = product((300.0,), onset.grid[::2], duration.grid[1:5])
-    paths = [f"{name}.{p}" for p in ("conductance", "onset", "duration")]
+    _, onset, duration, exponent = mechanism(name).description.parameters
+    every = product((300.0,), onset.grid[::2], duration.grid[1:5], exponent.grid[:1])
+    paths = [f"{name}.{p.name}" for p in mechanism(name).description.parameters]
     return [dict(zip(paths, point, strict=True)) for point in every]
 
 

@@ -11,7 +11,7 @@ from jax import Array
 
 from ventbench.base.files import data_beside
 from ventbench.physics.mechanism import Description, Mechanism, Network, Parameter, Values, View
-from ventbench.physics.mechanisms.circuit import Leak, ReliefLeak
+from ventbench.physics.mechanisms.circuit import ROUNDED, Leak, ReliefLeak
 
 _EVENTS = data_beside(__file__, "events.toml")
 
@@ -56,10 +56,15 @@ class Disconnection(Mechanism):
     description = _described("disconnection")
 
     def network(self, values: Values, network: Network, view: View) -> Network:
-        """Add the open end as a conductance."""
+        """Add the open end as its conductance at the last pressure.
+
+        A tangent there would take a jet far below the pressure of the room.
+        """
         since = view.time - values["onset"]
         off = (since > 0.0) & (since <= values["duration"])
-        return network.plus(leak=1e-3 * jnp.where(off, values["conductance"], 0.0))
+        power = 0.5 * (values["exponent"] - 1.0)
+        share = jnp.exp(power * jnp.log(view.pressure**2 + ROUNDED**2))
+        return network.plus(leak=1e-3 * jnp.where(off, values["conductance"], 0.0) * share)
 
 
 class IntermittentLeak(Leak):

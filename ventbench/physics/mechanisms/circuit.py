@@ -200,7 +200,7 @@ class CircuitCompliance(Mechanism):
 
 
 #: The root is rounded off below this pressure, cmH2O, where its slope would be infinite.
-_ROUND = 0.2
+ROUNDED = 0.2
 
 
 class Leak(Mechanism):
@@ -239,7 +239,7 @@ class Leak(Mechanism):
     def network(self, values: Values, network: Network, view: View) -> Network:
         """Tangent of the leak at the last pressure."""
         power = 0.5 * (values["exponent"] - 1.0)
-        square = view.pressure**2 + _ROUND**2
+        square = view.pressure**2 + ROUNDED**2
         # As square**power, in half the time: a power is no vector code.
         scale = 1e-3 * values["conductance"] * jnp.exp(power * jnp.log(square))
         slope = scale * (1.0 + 2.0 * power * view.pressure**2 / square)

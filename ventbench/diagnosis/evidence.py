@@ -533,7 +533,8 @@ class _Search:
         for key in self.contenders:
             s = self.scored[key]
             self.scored[key] = self.score(self.linear_model(around, s.fitted, noise, s.terms))
-        most = max(self.scored[key].evidence for key in self.contenders)
+        # a set that cannot be linearised around another has none, and is far behind
+        most = np.nanmax([self.scored[key].evidence for key in self.contenders])
         margin = self.settings.far_behind
         self.contenders = {
             key for key in self.contenders if self.scored[key].evidence > most - margin

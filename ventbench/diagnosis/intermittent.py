@@ -13,10 +13,11 @@ breaths in which the effect does not act, in turn with the question which these 
 were lost or late have no grid: each of them was followed or not (:mod:`.in_time`).
 
 The effect acts beside the mechanisms that the search has named. It is told if it predicts breaths,
-each left out once, better than these alone and than an error that nobody can place. A set of breaths that begins or ends at one breath of the
-recording is a change of the session and no such effect; one that commands predict is physics. The
-breaths that are affected are then set aside, or get the commands that reached the valve, and the
-rest of the diagnosis goes on without the effect. Breaths that judge are none of them.
+each left out once, better than these alone and than an error that nobody can place. A set of
+breaths that begins or ends at one breath of the recording is a change of the session and no such
+effect; one that commands predict is physics. The breaths that are affected are then set aside, or
+get the commands that reached the valve, and the rest of the diagnosis goes on without the effect.
+Breaths that judge are none of them.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from ci import workflow
 from ci.git import AUTHOR, Git
 from ventbench.base import files
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, gate, official_runs, rounds
+from ventbench.board import attestation, canonical, official_runs, rounds
 from ventbench.board.replay import ReplayPlants
 from ventbench.board.rounds import Round
 
@@ -88,12 +88,12 @@ def main() -> int:
     lines = []
     if scored := os.environ.get("SCORED"):
         # Read here, where no code of a submission runs.
-        secret = os.environ.get(gate.SECRET) or None
+        secret = os.environ.get(attestation.SECRET) or None
         result = add(Path(scored), checkout / "leaderboard", name, frozen.load(), secret).result
         assert result is not None
         lines += [f"{run}: record {sha256}" for run, sha256 in result.records.items()]
         lines += [f"{run}: {why}" for run, why in result.failed.items()]
-        lines.append("signed" if secret else f"not signed, not ranked: {gate.SECRET} unset")
+        lines.append("signed" if secret else f"not signed, not ranked: {attestation.SECRET} unset")
     state = rounds.load(checkout / "leaderboard", name).state
     branch = commit(checkout, name, state)
     workflow.output(branch=branch)

@@ -14,7 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ventbench.board import build, canonical, create, gate, record, replay, rounds, store
+from ventbench.board import (
+    attestation,
+    build,
+    canonical,
+    create,
+    record,
+    replay,
+    rounds,
+    store,
+)
 from ventbench.board.record import Record, Withdrawal
 from ventbench.board.replay import ReplayPlants, run_of
 from ventbench.entries import reference as references
@@ -300,7 +309,7 @@ def attest(folder: Path, lines: str = "", secret: str = KEY) -> None:
     """Write and sign the list of keys and second runs."""
     path = folder / canonical.ATTESTATIONS
     path.write_text(lines + lines_of(secret))
-    gate.sign(folder, path, secret)
+    attestation.sign(folder, path, secret)
 
 
 def close(folder: Path) -> None:
@@ -321,14 +330,14 @@ def close(folder: Path) -> None:
     failed = dict.fromkeys(sorted(runs - set(scored)), "it was not run")
     result = {"bounds": own.result.bounds, "records": scored, "failed": failed, "seeds": {}}
     path.write_bytes(canonical.canonical(result))
-    gate.sign(folder, path, KEY)
+    attestation.sign(folder, path, KEY)
 
 
 def lines_of(secret: str) -> str:
     """Lines of attestations.toml for a secret."""
-    public = gate._private(secret).public_key().public_bytes_raw()
+    public = attestation._private(secret).public_key().public_bytes_raw()
     return (
-        f'[[keys]]\nid = "{gate.key_id(public)}"\npublic = "{public.hex()}"\n'
+        f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
         'added = 2026-11-23\nholder = "a test"\n'
     )
 

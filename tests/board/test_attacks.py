@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from ventbench.board import canonical, gate, ranking, replay, store
+from ventbench.board import attestation, canonical, ranking, replay, store
 from ventbench.board.verify import verify
 
 from .conftest import KEY, ROUND
@@ -70,7 +70,7 @@ def swapped(board: Path) -> None:
 def invented_seeds(board: Path) -> None:
     """Give an entry seeds that nobody ran, and sign that."""
     rewrite(board, lambda result: result["seeds"].update({"softer (performance)": [0.5] * 5}))
-    gate.sign(board, board / "rounds" / ROUND / "result.json", KEY)
+    attestation.sign(board, board / "rounds" / ROUND / "result.json", KEY)
 
 
 def withdrawn(board: Path) -> None:
@@ -110,11 +110,11 @@ def test_the_signature_of_a_rival_is_missed(leaderboard: Path, simulators, tmp_p
     signed = shutil.copytree(leaderboard, tmp_path / "signed")
     listed = (signed / canonical.ATTESTATIONS).read_text()
     (signed / canonical.ATTESTATIONS).write_text(listed[listed.index("[[keys]]") :])
-    gate.sign(signed, signed / canonical.ATTESTATIONS, KEY)
+    attestation.sign(signed, signed / canonical.ATTESTATIONS, KEY)
     for one in store.record_paths(signed):
-        gate.sign(signed, one, KEY)
+        attestation.sign(signed, one, KEY)
     assert verify(signed, lambda: simulators).problems == [], "control"
     path = record_of(signed, "softer")
-    gate.signature_path(path).unlink()
+    attestation.signature_path(path).unlink()
     (problem,) = verify(signed, lambda: simulators).problems
     assert f"{path}, of round {ROUND}, is signed by no key" in problem

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import build, canonical, frames, gate, store
+from ventbench.board import attestation, build, canonical, frames, store
 from ventbench.board.verify import verify
 
 from .conftest import KEY, accept, attest, lines_of, put
@@ -52,7 +52,7 @@ def test_official_is_not_self_declared(unsigned: Path, simulators) -> None:
 def test_a_signed_record_is_official(unsigned: Path, simulators) -> None:
     attest(unsigned)
     for name in ("softer", "home"):
-        gate.sign(unsigned, store.path_of(unsigned, sha_of(unsigned, name)), KEY)
+        attestation.sign(unsigned, store.path_of(unsigned, sha_of(unsigned, name)), KEY)
     found = status(unsigned)
     assert found["softer"] == "ranked"
     assert found["harder"] == "not official"
@@ -70,7 +70,7 @@ def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
     monkeypatch.setattr(store, "conflicts", lambda *_, **__: [])  # as if nobody had looked
     put(leaderboard, draft("softer", factor=0.5), simulators)
     (leaderboard / canonical.ATTESTATIONS).write_text(accepted)
-    gate.sign(leaderboard, leaderboard / canonical.ATTESTATIONS, KEY)
+    attestation.sign(leaderboard, leaderboard / canonical.ATTESTATIONS, KEY)
     board = frames.load_board(leaderboard, track="performance").query("name == 'softer'")
     assert dict(zip(board["record"], board["status"], strict=True)) == {old: "ranked"}
 
@@ -78,7 +78,7 @@ def test_an_unsigned_record_does_not_take_the_place_of_a_signed_one(
 def test_wrong_signatures_are_named(unsigned: Path, simulators) -> None:
     attest(unsigned)
     softer, harder = (sha_of(unsigned, name) for name in ("softer", "harder"))
-    path = gate.sign(unsigned, store.path_of(unsigned, softer), KEY)
+    path = attestation.sign(unsigned, store.path_of(unsigned, softer), KEY)
     good = path.read_bytes()
     values = json.loads(good)
 
@@ -103,7 +103,7 @@ def test_wrong_signatures_are_named(unsigned: Path, simulators) -> None:
     assert "is not JSON" in problem()
     path.write_bytes(good)
     # The signature of one record is none of another.
-    moved = gate.signature_path(store.path_of(unsigned, harder))
+    moved = attestation.signature_path(store.path_of(unsigned, harder))
     moved.write_bytes(canonical.canonical(values | {"record": harder}))
     assert "the signature is not by key" in problem()
     moved.unlink()
@@ -120,7 +120,7 @@ def test_lists_are_checked(leaderboard: Path, simulators) -> None:
     path.write_text(
         f'[[second_runs]]\nrecord = "{"a" * 64}"\nreason = "x"\ndate = 2026-11-23\n{good}'
     )
-    gate.sign(leaderboard, path, KEY)
+    attestation.sign(leaderboard, path, KEY)
     (problem,) = verify(leaderboard, lambda: simulators).problems
     assert f"record {'a' * 64} is not there" in problem
     path.write_text(good.replace('reason = "a test"', 'reason = " "'))
@@ -134,15 +134,15 @@ def test_only_a_listed_key_signs(unsigned: Path) -> None:
     attest(unsigned)
     record = store.path_of(unsigned, sha_of(unsigned, "softer"))
     with pytest.raises(InputError, match="is not in"):
-        gate.sign(unsigned, record, "02" * 32)
+        attestation.sign(unsigned, record, "02" * 32)
     with pytest.raises(InputError, match="not a key of 64") as refused:
-        gate.sign(unsigned, record, "very secret")
+        attestation.sign(unsigned, record, "very secret")
     assert "very secret" not in str(refused.value)
 
 
 def test_without_the_library_there_is_advice(unsigned: Path, monkeypatch) -> None:
     attest(unsigned)
-    gate.sign(unsigned, store.path_of(unsigned, sha_of(unsigned, "softer")), KEY)
+    attestation.sign(unsigned, store.path_of(unsigned, sha_of(unsigned, "softer")), KEY)
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(InputError, match=r"pip install 'ventbench\[attest\]'"):
         store.load(unsigned)
@@ -156,7 +156,7 @@ def test_a_new_key_signs(unsigned: Path, monkeypatch) -> None:
     made = CliRunner().invoke(app, ["board", "new-key"]).output
     secret = made.splitlines()[1]
     (unsigned / canonical.ATTESTATIONS).write_text(made[made.index("[[keys]]") :])
-    monkeypatch.setitem(os.environ, gate.SECRET, secret)
+    monkeypatch.setitem(os.environ, attestation.SECRET, secret)
     name = sha_of(unsigned, "softer")
     for named in (name[:12], str(unsigned / canonical.ATTESTATIONS)):
         signed = CliRunner().invoke(app, ["board", "sign", named, "--folder", str(unsigned)])

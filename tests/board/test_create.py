@@ -112,7 +112,7 @@ def test_every_failure_is_there(draft, simulators, own) -> None:
     assert len(item.header.failures) == 30
     assert np.isnan(item.figures.nominal).sum() == 30
     assert np.isnan(item.figures.exploitation)
-    (first, *_) = gate.unfit(item, gate.Evidence())
+    (first, *_) = gate.unfit(item, store.Store(Path(), (), frozenset()))
     assert first.startswith("30 of 756 cells failed, the first: weak: xxx")
     assert len(first) < 400
 

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, frames, gate, replay
+from ventbench.board import attestation, canonical, frames, replay
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 
@@ -57,7 +57,7 @@ def test_seeds_stand_beside_the_entry_that_the_round_scored(leaderboard: Path) -
     result["records"] = {key: before.loc[("pid_best", "performance"), "record"]}
     result["seeds"] = {key: [60.0, 62.0, 61.0, 63.0, 90.0]}
     path.write_bytes(canonical.canonical(result))
-    gate.sign(leaderboard, path, KEY)
+    attestation.sign(leaderboard, path, KEY)
     board: Any = frames.load_board(leaderboard)
     told = board[board["seeds"].notna()]
     assert told[["name", "track"]].values.tolist() == [["pid_best", "performance"]]
@@ -66,7 +66,7 @@ def test_seeds_stand_beside_the_entry_that_the_round_scored(leaderboard: Path) -
     assert 60.0 <= low < middle < high <= 90.0
     result["records"][key] = "0" * 64
     path.write_bytes(canonical.canonical(result))
-    gate.sign(leaderboard, path, KEY)
+    attestation.sign(leaderboard, path, KEY)
     board = frames.load_board(leaderboard)
     assert board["seeds"].isna().all()
 

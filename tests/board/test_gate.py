@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, frames, gate, ranking, record, replay, store
-from ventbench.board.gate import Evidence
+from ventbench.board import attestation, canonical, frames, gate, ranking, record, replay, store
 from ventbench.board.record import HardwareRecord
 from ventbench.task import protocol
 
@@ -125,14 +124,14 @@ def test_forged_hardware_is_refused(
 def test_unsafe_hardware_that_says_so_has_no_rank(template) -> None:
     runs = _higher(np.array(pressures())).tolist()
     made = measured(hardware(template, runs, safe=[False]))
-    vouched = Evidence(frozenset([made.sha256]))
+    vouched = store.Store(Path(), (), frozenset([made.sha256]))
     assert gate.measured(made, vouched) == ("did not pass the safety gate on R5C20",)
 
 
 @pytest.mark.parametrize("parts", [{LUNG: ["lung", "sweep"]}, {}])
 def test_a_lung_that_was_not_identified_has_no_rank(template, parts: dict[str, list[str]]) -> None:
     made = measured(hardware(template, pressures(), selftest=parts))
-    vouched = Evidence(frozenset([made.sha256]))
+    vouched = store.Store(Path(), (), frozenset([made.sha256]))
     unknown = f"no self-test of which lung was mounted on {LUNG}"
     zero = () if parts else (f"no self-test of the sensor's zero on {LUNG}",)
     assert gate.measured(made, vouched) == (*zero, unknown)
@@ -161,19 +160,19 @@ def test_only_a_bench_log_ranks_hardware(leaderboard: Path, template) -> None:
 
     def listing(text: str) -> None:
         listed.write_text(text)
-        gate.sign(leaderboard, listed, KEY)
+        attestation.sign(leaderboard, listed, KEY)
 
     def row():
         return frames.load_tracks(leaderboard, track="performance")[0].hardware[0]
 
     assert (row().rank, row().reasons) == (None, (gate.NO_BENCH_LOG,))
-    public = gate._private(SECRET).public_key().public_bytes_raw()
+    public = attestation._private(SECRET).public_key().public_bytes_raw()
     key = (
-        f'[[keys]]\nid = "{gate.key_id(public)}"\npublic = "{public.hex()}"\n'
+        f'[[keys]]\nid = "{attestation.key_id(public)}"\npublic = "{public.hex()}"\n'
         'added = 2026-11-23\nholder = "a test"\n'
     )
     listing(before + key)
-    gate.sign(leaderboard, store.path_of(leaderboard, made.sha256), SECRET)
+    attestation.sign(leaderboard, store.path_of(leaderboard, made.sha256), SECRET)
     assert row().rank is None
     second = f'[[second_runs]]\nrecord = "{made.sha256}"\nreason = "a test"\ndate = 2026-11-23\n'
     listing(before + key + second)
@@ -208,12 +207,11 @@ def test_an_invented_record_has_no_rank(leaderboard: Path) -> None:
     """Nobody vouches for the changed record: its hash is another one."""
     board = replay.load(leaderboard)
     honest = next(x for x in board.scores if x.name == "pid_robust")
-    evidence = board.evidence
-    assert gate.simulated(honest, evidence) == (), "control"
+    assert gate.simulated(honest, board) == (), "control"
     assert honest.figures.stressed is None
     assert not any(row.stress_place for track in ranking.board(board) for row in track.rows)
     forged = dataclasses.replace(honest, sha256="f" * 64)
-    assert gate.UNATTESTED in gate.simulated(forged, evidence)
+    assert gate.UNATTESTED in gate.simulated(forged, board)
 
 
 def test_what_a_record_says_of_itself_ranks_nothing(leaderboard: Path) -> None:
@@ -223,11 +221,11 @@ def test_what_a_record_says_of_itself_ranks_nothing(leaderboard: Path) -> None:
     named = {score.name: score for score in board.scores}
     for name in ("softer", "robust", "pid_best"):
         assert named[name].official
-        assert gate.simulated(named[name], board.evidence) == (gate.UNATTESTED,)
+        assert gate.simulated(named[name], board) == (gate.UNATTESTED,)
     accept(leaderboard)
-    evidence = store.load(leaderboard).evidence
-    assert gate.simulated(named["softer"], evidence) == ()
-    home = gate.simulated(named["home"], evidence)
+    board = store.load(leaderboard)
+    assert gate.simulated(named["softer"], board) == ()
+    home = gate.simulated(named["home"], board)
     assert home[0].startswith("not official: its sandbox lacked a layer")
 
 

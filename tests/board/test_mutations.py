@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from ventbench.board import build, canonical, gate, replay, rounds, store
+from ventbench.board import attestation, build, canonical, replay, rounds, store
 from ventbench.board.record import Record
 from ventbench.board.verify import verify
 
@@ -37,11 +37,11 @@ def published(
         put(folder, drafts[name], simulators)
     softer = next(x for x in store.load(folder).scores if x.name == "softer")
     withdrawal = store.withdraw(folder, softer.sha256, "a bug")
-    gate.sign(folder, store.path_of(folder, withdrawal.sha256), KEY)
+    attestation.sign(folder, store.path_of(folder, withdrawal.sha256), KEY)
     _with_seeds(folder, drafts["harder"], simulators)
     notes = folder / "rounds" / ROUND / canonical.NOTES
     notes.write_text(tomli_w.dumps({"entries": {"pid_best": "The hundred of the scale."}}))
-    gate.sign(folder, notes, KEY)
+    attestation.sign(folder, notes, KEY)
     build.build(folder, folder, lambda: simulators)
     return folder
 
@@ -59,7 +59,7 @@ def _with_seeds(folder: Path, made: Any, simulators) -> None:
     result = msgspec.to_builtins(own.result) | {"seeds": {key: scores}}
     path = own.folder / rounds.RESULT
     path.write_bytes(canonical.canonical(result))
-    gate.sign(folder, path, KEY)
+    attestation.sign(folder, path, KEY)
     listed = {key: [msgspec.to_builtins(commands)]}
     (own.folder / canonical.SEEDS).write_bytes(canonical.canonical(listed))
 

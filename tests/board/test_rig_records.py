@@ -11,12 +11,12 @@ import pytest
 from ventbench.base.errors import InputError
 from ventbench.base.text import number
 from ventbench.board import (
+    attestation,
     build,
     canonical,
     comparison,
     create,
     frames,
-    gate,
     pages,
     replay,
     rounds,
@@ -245,7 +245,7 @@ def test_a_lowered_bound_is_found(board, simulators, reference, tmp_path):
     path = own / rounds.RESULT
     result = json.loads(path.read_bytes()) | {"bounds": sha256}
     path.write_bytes(canonical.canonical(result))
-    gate.sign(folder, path, KEY)
+    attestation.sign(folder, path, KEY)
     problems = verify.verify(folder, lambda: simulators).problems
     assert any("its commands or PIDs do not attain its errors" in text for text in problems)
 
@@ -261,7 +261,7 @@ def bounded(board, simulators, tmp_path, reference, change):
     result = json.loads((own / rounds.RESULT).read_bytes())
     result["bounds"] = forged.save(own / rounds.BOUNDS)
     (own / rounds.RESULT).write_bytes(canonical.canonical(result))
-    gate.sign(folder, own / rounds.RESULT, KEY)
+    attestation.sign(folder, own / rounds.RESULT, KEY)
     return verify.verify(folder, lambda: simulators, recomputed=2).problems
 
 

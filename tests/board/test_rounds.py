@@ -200,13 +200,13 @@ def test_what_was_not_frozen_has_no_rank(leaderboard: Path, drafts, simulators) 
     put(leaderboard, made, simulators)
     board = replay.load(leaderboard)
     record = next(x for x in board.scores if x.name == "unknown")
-    assert gate.simulated(record, board.evidence) == ("its code was not frozen in round r1",)
+    assert gate.simulated(record, board) == ("its code was not frozen in round r1",)
     assert own.exists()
 
 
 def test_practice_is_never_ranked(full: Path) -> None:
     record = next(x for x in replay.load(full).scores if x.name == "softer")
-    vouched = gate.Evidence(frozenset([record.sha256]))
+    vouched = store.Store(Path(), (), frozenset([record.sha256]))
     assert gate.simulated(record, vouched) == (PRACTICE,)
 
 

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from ventbench.board import frames, gate, official_runs, rounds
+from ventbench.board import attestation, frames, official_runs, rounds
 from ventbench.cli import app
 from ventbench.entries import reference as references
 from ventbench.entries.cells import InProcessRunner
@@ -69,7 +69,7 @@ def test_two_rounds_with_outsiders_refused_and_returning_entries(
     """
     inside, board, work = tmp_path / "submissions", tmp_path / "leaderboard", tmp_path / "work"
     monkeypatch.setattr(rounds, "bundled", lambda: sorted(x.name for x in inside.iterdir()))
-    monkeypatch.setenv(gate.SECRET, KEY)
+    monkeypatch.setenv(attestation.SECRET, KEY)
     chain, listed = tmp_path / "chain.json", list[Any]()
     chain.write_bytes(msgspec.json.encode(referee.chain(SECRET)))
 

@@ -5,7 +5,8 @@
 - :mod:`~ventbench.board.record`: a record as arrays; :mod:`~ventbench.board.create` makes one;
 - :mod:`~ventbench.board.replay`: recorded commands through the frozen simulators again;
 - :mod:`~ventbench.board.store`: the folder ``leaderboard/``, commands of scored runs without loss;
-- :mod:`~ventbench.board.gate`: who vouches for a record, and what may be ranked;
+- :mod:`~ventbench.board.attestation`: who vouches for a record;
+- :mod:`~ventbench.board.gate`: what may be ranked;
 - :mod:`~ventbench.board.ranking`: which record of an entry counts, ranks, intervals, differences;
 - :mod:`~ventbench.board.frames`: the columns of the board, its CSV and pandas frames;
 - :mod:`~ventbench.board.build`: the site, with :mod:`~ventbench.board.pages`;

@@ -18,7 +18,6 @@ from ventbench.base.text import flatten
 from ventbench.board import canonical, frames, pages, ranking, replay
 from ventbench.board.figures import Figures
 from ventbench.board.frames import Column
-from ventbench.board.gate import Evidence
 from ventbench.board.ranking import BASELINES, Row, Track
 from ventbench.board.record import Record
 from ventbench.board.replay import TRACE_BREATH, Load
@@ -60,7 +59,7 @@ def content(leaderboard: Store) -> dict[str, bytes]:
         page = _index(environment, leaderboard, of_round, "../", round_)
         built[f"{canonical.ROUNDS}/{round_.name}.html"] = page.encode()
     for track in tracks:
-        built.update(_entry_pages(environment, track, leaderboard.evidence))
+        built.update(_entry_pages(environment, track, leaderboard))
     return built
 
 
@@ -174,7 +173,7 @@ def _aside(row: Row) -> dict[str, Any]:
 
 
 def _entry_pages(
-    environment: jinja2.Environment, track: Track, evidence: Evidence
+    environment: jinja2.Environment, track: Track, leaderboard: Store
 ) -> dict[str, bytes]:
     """Return the pages of all entries of a track by their paths."""
     template = environment.get_template("entry.html.j2")
@@ -185,7 +184,7 @@ def _entry_pages(
         name = row.record.name
         path = pages.address(row.record)
         compared = None if row is base else base
-        values = _values(row, evidence)
+        values = _values(row, leaderboard)
         values["compared"] = compared and compared.record.name
         values["count"] = len(track.listed)
         panels = pages.panels(pages.paths(row.record), compared and baseline_paths)
@@ -203,7 +202,7 @@ def _entry_pages(
     return rendered
 
 
-def _values(row: Row, evidence: Evidence) -> dict[str, Any]:
+def _values(row: Row, leaderboard: Store) -> dict[str, Any]:
     record, header, figures = row.record, row.record.header, row.record.figures
     cells = {column.names[0]: column.cell(row) for column in PAGE_COLUMNS}
     return {
@@ -227,7 +226,7 @@ def _values(row: Row, evidence: Evidence) -> dict[str, Any]:
         "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in LUNGS],
         "breath": TRACE_BREATH + 1,
         "provenance": _provenance(header),
-        "history": _history(row, evidence),
+        "history": _history(row, leaderboard),
         "protocol": protocol,
         "box": f"0 0 {pages.WIDTH} {pages.HEIGHT}",
     }
@@ -270,11 +269,11 @@ def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]
     return [(title, rows) for title, rows in flat if rows]
 
 
-def _history(row: Row, evidence: Evidence) -> list[dict[str, Any]]:
+def _history(row: Row, leaderboard: Store) -> list[dict[str, Any]]:
     """All records of the entry, newest first, and what became of each."""
     lines = []
     for record in row.history:
-        withdrawn = evidence.withdrawn.get(record.sha256)
+        withdrawn = leaderboard.withdrawn.get(record.sha256)
         state = "counts" if record.sha256 == row.record.sha256 else "does not count"
         lines.append(
             {

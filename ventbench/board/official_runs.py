@@ -28,7 +28,7 @@ from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.executor import Progress, executor, results
-from ventbench.board import canonical, create, gate, record, rounds, schema, store
+from ventbench.board import attestation, canonical, create, record, rounds, schema, store
 from ventbench.board.canonical import RECORDS, SEEDS
 from ventbench.board.record import Record
 from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay, seed_scores
@@ -135,7 +135,7 @@ def rerun(
         elif code is None:
             why = "no folder at hand has the files that it names; give --source DIR"
         else:
-            round_ = board.evidence.rounds.get(score.header.draws.season)
+            round_ = board.seeded.get(score.header.draws.season)
             todo[score.sha256] = score, round_, code, folder.resolve(), load, runner
             continue
         outcomes[score.sha256] = Outcome(score, NOT_RERUN, why)
@@ -503,7 +503,7 @@ def close(
             result.failed[key] = str(error)[: schema.MAX_TEXT]
             continue
         if secret:
-            gate.sign(leaderboard, path, secret)
+            attestation.sign(leaderboard, path, secret)
         result.records[key] = sha256
         if scores:
             of_seeds[key], result.seeds[key] = commands, scores
@@ -513,7 +513,7 @@ def close(
             progress("records", count, len(round_.runs))
     _write(round_.folder, of_seeds, result)
     if secret:
-        gate.sign(leaderboard, round_.folder / RESULT, secret)
+        attestation.sign(leaderboard, round_.folder / RESULT, secret)
     return rounds.load(leaderboard, name)
 
 

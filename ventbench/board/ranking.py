@@ -23,7 +23,6 @@ from ventbench.base.interval import Interval
 from ventbench.board import comparison, gate, store
 from ventbench.board.canonical import RECORDS
 from ventbench.board.comparison import CMH2O, POINTS
-from ventbench.board.gate import Evidence
 from ventbench.board.record import HardwareRecord, Record
 from ventbench.board.rounds import Round, key_of
 from ventbench.board.store import Store
@@ -192,15 +191,14 @@ class Track:
 
 def board(leaderboard: Store) -> tuple[Track, ...]:
     """Rank all records: both tracks of every round, the newest first, and practice last."""
-    evidence = leaderboard.evidence
     grouped: dict[tuple[str, str], dict[str, list[Record]]] = defaultdict(dict)
     for record in (x for x in leaderboard.scores if x.derived):
         season = record.header.draws.season
-        histories = grouped[season if season in evidence.rounds else DEVELOPMENT, record.track]
+        histories = grouped[season if season in leaderboard.seeded else DEVELOPMENT, record.track]
         histories.setdefault(record.name, []).insert(0, record)
     tracks = [
-        _track(leaderboard, draws, name, grouped[draws, name], evidence)
-        for draws in (*evidence.rounds, DEVELOPMENT)
+        _track(leaderboard, draws, name, grouped[draws, name])
+        for draws in (*leaderboard.seeded, DEVELOPMENT)
         for name in TRACKS
     ]
     # Hardware stands beside the newest simulated ranking.
@@ -222,22 +220,22 @@ def _track(
     draws: str,
     name: str,
     histories: dict[str, list[Record]],
-    evidence: Evidence,
 ) -> Track:
     """Sort the entries of a track: listed, not ranked, not official."""
-    round_ = evidence.rounds.get(draws)
+    round_ = leaderboard.seeded.get(draws)
     rows: dict[str, list[Row]] = defaultdict(list)
     for _, history in sorted(histories.items()):
         # The one that is not withdrawn; nobody takes an official one's place.
         record = min(
-            history, key=lambda x: (x.sha256 in evidence.withdrawn, not evidence.official(x))
+            history,
+            key=lambda x: (x.sha256 in leaderboard.withdrawn, not gate.official(x, leaderboard)),
         )
-        why = gate.simulated(record, evidence)
+        why = gate.simulated(record, leaderboard)
         status = "ranked"
         if round_ is None:
             status, why = "practice", tuple(x for x in why if x != gate.PRACTICE)
         status = "not ranked" if why else status
-        status = status if evidence.official(record) else "not official"
+        status = status if gate.official(record, leaderboard) else "not official"
         result, key = round_ and round_.result, key_of(record.name, record.track)
         counts = result is not None and result.records.get(key) == record.sha256
         seeds = result.seeds.get(key, ()) if result and counts else ()
@@ -331,7 +329,6 @@ def _ranked_under_stress(rows: list[Row]) -> list[Row]:
 
 def _hardware_rows(leaderboard: Store, track: Track) -> tuple[HardwareRow, ...]:
     """Rows of a track's hardware records, newest first."""
-    evidence = leaderboard.evidence
     simulated = {row.record.name: row for row in reversed(track.rows)}
     rows: list[HardwareRow] = []
     vouched_entries: set[tuple[str, bool]] = set()
@@ -340,10 +337,10 @@ def _hardware_rows(leaderboard: Store, track: Track) -> tuple[HardwareRow, ...]:
             continue
         # Nobody takes a vouched-for record's place by one that nobody vouches for.
         key = (record.name, record.emulated)
-        newest = record.sha256 not in evidence.withdrawn and key not in vouched_entries
-        if newest and record.sha256 in evidence.vouched:
+        newest = record.sha256 not in leaderboard.withdrawn and key not in vouched_entries
+        if newest and record.sha256 in leaderboard.attested:
             vouched_entries.add(key)
-        why = gate.measured(record, evidence)
+        why = gate.measured(record, leaderboard)
         rows.append(HardwareRow(record, why, newest, simulated.get(record.name)))
     return tuple(_hardware_rank(row, rows) for row in rows)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,8 @@ import numpy as np
 from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
-from ventbench.board import canonical, gate, record, rounds, schema
+from ventbench.board import attestation, canonical, record, rounds, schema
 from ventbench.board.canonical import RECORDS
-from ventbench.board.gate import Evidence
 from ventbench.board.record import AnyRecord, HardwareRecord, Record, Withdrawal
 from ventbench.board.rounds import Round
 from ventbench.board.schema import Commands
@@ -37,20 +37,23 @@ class Store:
     folder: Path  #: of the leaderboard.
     records: tuple[AnyRecord, ...]  #: all of them.
     #: hashes of the records that somebody who may do so vouches for; see
-    #: :mod:`ventbench.board.gate`.
+    #: :mod:`ventbench.board.attestation`.
     attested: frozenset[str]
     rounds: tuple[Round, ...] = ()  #: all of them, the newest first.
 
-    @property
-    def evidence(self) -> Evidence:
-        """What stands behind the records."""
-        withdrawn = {
+    @cached_property
+    def withdrawn(self) -> dict[str, str]:
+        """Why records were taken back, by hash."""
+        return {
             x.withdraws: x.reason
             for x in self.records
             if isinstance(x, Withdrawal) and x.sha256 in self.attested
         }
-        seeded = {x.name: x for x in self.rounds if x.value is not None}
-        return Evidence(self.attested, withdrawn, seeded)
+
+    @cached_property
+    def seeded(self) -> dict[str, Round]:
+        """Rounds that have draws, by name."""
+        return {x.name: x for x in self.rounds if x.value is not None}
 
     @property
     def scores(self) -> list[Record]:
@@ -83,7 +86,7 @@ def load(folder: Path) -> Store:
         OSError: if one cannot be read.
     """
     records = in_order(read_record(path) for path in record_paths(folder))
-    attested, problems = gate.attested(folder, measured(records))
+    attested, problems = attestation.attested(folder, measured(records))
     if problems:
         raise InputError(problems[0])
     return Store(folder, records, attested, rounds.load_all(folder))
@@ -149,7 +152,7 @@ def find_signed(folder: Path, named: str) -> Path:
     Raises:
         InputError: if it is no such file, or several of them.
     """
-    if (path := Path(named)) in gate.statements(folder):
+    if (path := Path(named)) in attestation.statements(folder):
         return path
     matches = sorted((folder / RECORDS).glob(f"{named}*{record.SUFFIX}"))
     if len(matches) != 1:

@@ -24,7 +24,7 @@ import numpy as np
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.base.executor import Progress
-from ventbench.board import build, canonical, frames, gate, ranking, rounds, store
+from ventbench.board import attestation, build, canonical, frames, ranking, rounds, store
 from ventbench.board.canonical import ATTESTATIONS, RECORDS
 from ventbench.board.official_runs import code_in, folders
 from ventbench.board.record import Withdrawal
@@ -121,7 +121,7 @@ def verify(
     problems += [f"{folder / x} is no plain file or folder; remove it" for x in odd]
     problems += store.conflicts(entries)
     complete = len(entries) == len(paths)
-    vouched, wrong_lists = gate.attested(folder, store.measured(entries))
+    vouched, wrong_lists = attestation.attested(folder, store.measured(entries))
     problems += wrong_lists if complete else []
     leaderboard = Store(folder, entries, vouched, read)
     complete &= len(read) == len(names)
@@ -173,8 +173,8 @@ def _strange_files(leaderboard: Store, plain: set[str], *, complete: bool) -> li
     named = {f"{x.sha256}{canonical.ACTIONS_SUFFIX}" for own in used for x in own}
     for entry in leaderboard.records:
         path = store.path_of(folder, entry.sha256)
-        named |= {path.name, gate.signature_path(path).name}
-    signatures = {gate.signature_path(path) for path in gate.statements(folder)}
+        named |= {path.name, attestation.signature_path(path).name}
+    signatures = {attestation.signature_path(path) for path in attestation.statements(folder)}
     for path in (folder / name for name in sorted(plain)):
         if not canonical.named(path.relative_to(folder).as_posix()):
             problems.append(f"{path} is no part of a leaderboard; remove it")
@@ -189,8 +189,8 @@ def _strange_files(leaderboard: Store, plain: set[str], *, complete: bool) -> li
 def _unsigned(leaderboard: Store) -> list[str]:
     """Withdrawals and statements that nobody vouches for who may do so."""
     folder = leaderboard.folder
-    nobody = not gate.read_list(folder).keys  # who could sign a list without keys?
-    paths = [x for x in gate.statements(folder) if not nobody or x.name != ATTESTATIONS] + [
+    nobody = not attestation.read_list(folder).keys  # who could sign a list without keys?
+    paths = [x for x in attestation.statements(folder) if not nobody or x.name != ATTESTATIONS] + [
         store.path_of(leaderboard.folder, x.sha256)
         for x in leaderboard.records
         if isinstance(x, Withdrawal)
@@ -229,7 +229,7 @@ def _unaccounted(round_: Round, leaderboard: Store) -> list[str]:
             problems.append(f"{path}, key records: {at} is not of {key} as it was frozen")
         elif record.official and sha256 not in leaderboard.attested:
             problems.append(f"{at}, of round {round_.name}, is signed by no key of {ATTESTATIONS}")
-    withdrawn = leaderboard.evidence.withdrawn
+    withdrawn = leaderboard.withdrawn
     corrected = {runs[k][:2] for k, sha in result.records.items() if k in runs and sha in withdrawn}
     problems += [
         f"{store.path_of(leaderboard.folder, x.sha256)} is not in {path}"

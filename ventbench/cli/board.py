@@ -100,13 +100,13 @@ def withdraw(
     """
     import os
 
-    from ventbench.board import gate, store
+    from ventbench.board import attestation, store
 
     withdrawal = store.withdraw(folder, record, reason)
     typer.echo(f"withdrew {withdrawal.withdraws}")
-    secret = os.environ.get(gate.SECRET, "")
+    secret = os.environ.get(attestation.SECRET, "")
     if secret:
-        gate.sign(folder, store.path_of(folder, withdrawal.sha256), secret)
+        attestation.sign(folder, store.path_of(folder, withdrawal.sha256), secret)
     typer.echo(f"next: ventbench board {'build' if secret else f'sign {withdrawal.sha256[:12]}'}")
 
 
@@ -129,13 +129,13 @@ def sign(
     """
     import os
 
-    from ventbench.board import gate, store
+    from ventbench.board import attestation, store
 
-    secret = os.environ.get(gate.SECRET, "")
+    secret = os.environ.get(attestation.SECRET, "")
     if not secret:
-        raise InputError(f"environment variable {gate.SECRET} holds no key")
+        raise InputError(f"environment variable {attestation.SECRET} holds no key")
     signed = store.find_signed(folder, record)
-    typer.echo(f"signed {signed}: {gate.sign(folder, signed, secret)}")
+    typer.echo(f"signed {signed}: {attestation.sign(folder, signed, secret)}")
     typer.echo("next: ventbench board build")
 
 
@@ -145,10 +145,10 @@ def new_key() -> None:
 
     Example: `ventbench board new-key`
     """
-    from ventbench.board import gate
+    from ventbench.board import attestation
 
-    secret, lines = gate.new_key()
-    typer.echo(f"# secret: {gate.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
+    secret, lines = attestation.new_key()
+    typer.echo(f"# secret: {attestation.SECRET} of the workflow; keep it nowhere else\n{secret}\n")
     typer.echo(f"# public: for leaderboard/attestations.toml\n{lines}", nl=False)
 
 

@@ -199,7 +199,7 @@ def score(
     import os
 
     from ventbench.base.executor import executor
-    from ventbench.board import gate, official_runs, rounds
+    from ventbench.board import attestation, official_runs, rounds
 
     round_ = rounds.load(folder, name)
     if plan:
@@ -219,7 +219,7 @@ def score(
             out / name,
             places=[folder.parent / "submissions", *(source or [])],
             only=only or (),
-            secret=os.environ.get(gate.SECRET) or None,
+            secret=os.environ.get(attestation.SECRET) or None,
             progress=tell,
         )
     _print_round(result, json)

@@ -134,15 +134,13 @@ def _swapped(named: frozenset[str], found: Mapping[str, Any]) -> dict[frozenset[
     Held-out breaths accept what is named; they do not choose between it and its rivals.
     """
     weights = {frozenset(each["terms"]): each["probability"] for each in found["posterior"]}
-    odds = {named: 1.0}
+    if named not in weights:
+        return {named: 1.0}
+    odds = {named: weights[named]}
     for missing in found["mechanisms"]:
-        name, confidence, others = (missing[k] for k in ("name", "confidence", "alternatives"))
-        for other in others:
-            swapped = named - {name} | {other}
-            if missing["affected_breaths"]:
-                odds[swapped] = odds.get(swapped, 0.0) + (1.0 / confidence - 1.0) / len(others)
-            elif named in weights:
-                odds[swapped] = weights.get(swapped, 0.0) / weights[named]
+        for other in missing["alternatives"]:
+            swapped = named - {missing["name"]} | {other}
+            odds[swapped] = weights.get(swapped, 0.0)
     total = sum(odds.values())
     return {names: each / total for names, each in odds.items()}
 

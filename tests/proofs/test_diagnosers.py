@@ -22,6 +22,7 @@ from proofs.diagnosers import classifier
 from proofs.diagnosers.gaussian_process import _Process
 from proofs.diagnosers.sindy import thresholded_least_squares
 from proofs.diagnosers.ventbench import CALIBRATION, hypotheses
+from ventbench.diagnosis.diagnose import with_effect
 
 
 def test_the_project_enters_itself_and_its_rivals() -> None:
@@ -128,16 +129,14 @@ def test_the_posterior_is_passed_on_beside_what_held_out_breaths_accept() -> Non
 
 def test_a_rival_of_an_effect_of_some_breaths_has_its_share() -> None:
     share = (1.0 - CALIBRATION.unsure) * CALIBRATION.accepted
+    lag = frozenset({"valve_lag"})
     lost = named("lost_commands", 0.6, "late_commands", affected=[2, 5])
-    lag = named("valve_lag", 0.4, "valve_delay")
-    answer = told(
-        "named", "lost_commands", "valve_lag", posterior=[{"terms": [], "probability": 1}]
-    )
-    assert answer[terms("lost_commands", "valve_lag")] == pytest.approx(share)
-    answer = told("named", mechanisms=[lost, lag], posterior=[{"terms": [], "probability": 1}])
-    assert answer[terms("lost_commands", "valve_lag")] == pytest.approx(0.6 * share)
-    assert answer[terms("late_commands", "valve_lag")] == pytest.approx(0.4 * share)
-    assert terms("lost_commands", "valve_delay") not in answer  # its share is the posterior's
+    beside = with_effect({lag: 1.0}, "lost_commands", 0.6, ["late_commands"])
+    weighed = [{"terms": list(each), "probability": p} for each, p in beside.items()]
+    answer = told("named", mechanisms=[lost, named("valve_lag", 0.4)], posterior=weighed)
+    for effect, confidence in (("lost_commands", 0.6), ("late_commands", 0.4)):
+        searched = (1.0 - CALIBRATION.unsure) * (1.0 - CALIBRATION.accepted) * confidence
+        assert answer[lag | {effect}] == pytest.approx(confidence * share + searched)
 
 
 def test_rivals_of_a_name_share_what_held_out_breaths_accept() -> None:

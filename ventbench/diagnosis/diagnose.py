@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
@@ -180,16 +180,31 @@ def diagnose(
             diagnosis = behind.conclude(
                 _conclude(behind.sensed, alone, excluded, tell, settings), settings
             )
-    apart = {missing.name for missing in intermittent}
     weights = alone.conclusion.posterior.weights
+    for missing in intermittent:
+        weights = with_effect(weights, missing.name, missing.confidence, missing.alternatives)
     return replace(
         diagnosis,
         verdict="named" if intermittent else diagnosis.verdict,
-        posterior=likeliest_sets({names | apart: weight for names, weight in weights.items()}),
+        posterior=likeliest_sets(weights),
         mechanisms=(*intermittent, *diagnosis.mechanisms),
         simulator=_name(simulator, simulators),
         seconds=time.perf_counter() - began,
     )
+
+
+def with_effect(
+    weights: Mapping[frozenset[str], float], name: str, confidence: float, rivals: Sequence[str]
+) -> dict[frozenset[str], float]:
+    """Posterior of sets beside an effect of some breaths, or beside one of its rivals."""
+    others: list[frozenset[str]] = [frozenset({rival}) for rival in rivals] or [frozenset()]
+    shares = {frozenset({name}): confidence}
+    shares |= dict.fromkeys(others, (1.0 - confidence) / len(others))
+    joined: dict[frozenset[str], float] = {}
+    for names, weight in weights.items():
+        for effect, share in shares.items():
+            joined[names | effect] = joined.get(names | effect, 0.0) + weight * share
+    return joined
 
 
 def _halfway(experiment: Experiment) -> float:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.extend.core import jaxpr_as_fun
 from numpy.typing import ArrayLike
 
 from ventbench.base.arrays import Floats
@@ -478,18 +479,19 @@ def apply_if_active(
     if active is None:
         return change(before)
     leaves, tree = jax.tree.flatten(before)
-    traced = jax.make_jaxpr(change)(before).jaxpr
-    ends = zip(traced.invars, traced.outvars, strict=True)
+    traced = jax.make_jaxpr(change)(before)
+    ends = zip(traced.jaxpr.invars, traced.jaxpr.outvars, strict=True)
     replaced = [k for k, (old, new) in enumerate(ends) if new is not old]
     if not replaced:
         return before
+    after = jaxpr_as_fun(traced)  # calling the change again would trace it twice
 
     def changed(*operands: Array) -> tuple[Array, ...]:
         current = list(leaves)
         for k, leaf in zip(replaced, operands, strict=True):
             current[k] = leaf
-        after = jax.tree.leaves(change(jax.tree.unflatten(tree, current)))
-        return tuple(after[k] for k in replaced)
+        values = after(*current)
+        return tuple(values[k] for k in replaced)
 
     operands = [leaves[k] for k in replaced]
     for k, leaf in zip(replaced, jax.lax.cond(active, changed, _same, *operands), strict=True):

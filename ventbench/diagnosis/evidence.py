@@ -533,11 +533,11 @@ class _Search:
         for key in self.contenders:
             s = self.scored[key]
             self.scored[key] = self.score(self.linear_model(around, s.fitted, noise, s.terms))
-        # a set that cannot be linearised around another has absurd evidence
-        evidence = {key: self.scored[key].evidence for key in self.contenders}
-        most = max(value for value in evidence.values() if abs(value) < 1e9)
-        least = most - self.settings.far_behind
-        self.contenders = {key for key, value in evidence.items() if least <= value < 1e9}
+        most = max(self.scored[key].evidence for key in self.contenders)
+        margin = self.settings.far_behind
+        self.contenders = {
+            key for key in self.contenders if self.scored[key].evidence > most - margin
+        }
 
     def ordered(self) -> list[Scored]:
         """Sets that were fitted and are not far behind, likeliest first."""

@@ -18,7 +18,7 @@ from ventbench.diagnosis.hypothesis import FittedModel
 from ventbench.physics.catalogue import library, mechanism, strength_path
 from ventbench.physics.mechanism import Parameter
 from ventbench.system_id.data import Data, Noise, robust_noise
-from ventbench.system_id.predictor import START, Predictor
+from ventbench.system_id.predictor import START, UNSTABLE, Predictor
 from ventbench.system_id.problem import parameter_of
 
 #: Standard deviations: of a characteristic and of what every rig has of a basis term, as shares of
@@ -216,7 +216,7 @@ def simulate(
     predicted = predictor.predict_all(np.stack(perturbed))[:, :, 0]
     # a point that the model cannot simulate changes nothing, so no evidence chooses it
     predicted = np.where(
-        np.isfinite(predicted).all(axis=(1, 2), keepdims=True), predicted, predicted[0]
+        (np.abs(predicted) < UNSTABLE).all(axis=(1, 2), keepdims=True), predicted, predicted[0]
     )
     columns = [
         (pressure - predicted[0]) / scale.get(k, 1.0) for k, pressure in enumerate(predicted[1:])

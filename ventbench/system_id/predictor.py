@@ -30,6 +30,10 @@ Ints = NDArray[np.int_]
 #: Path of the reading that a breath starts from, cmH2O; it is no parameter of the model.
 START = "start"
 
+#: Change of a reading, cmH2O or mL/s, by a unit of any parameter that is none of a rig: a jump of
+#: 3 L/s within 10 ms is 3e5 a second of delay. What exceeds it has diverged.
+UNSTABLE = 1e7
+
 #: Numbers of simulations to compile for, unless told otherwise: the least that holds all breaths,
 #: or the last.
 SIZES = (4, 8, 16, 32, 64)
@@ -224,7 +228,8 @@ class Predictor:
         Pressures are continuous in all free parameters; a parameter in which they are not, such as
         the bias of a rounding, is tried value by value. An effect that may have either sign can
         have a kink where it is off: there, the derivative is the mean of both one-sided slopes.
-        It is zero where the model can simulate a breath, but not at the point beside it.
+        It is zero where the model can simulate a breath, but not at the point beside it, or only by
+        an integration that diverges.
         """
         moves = np.stack([self._move(values[:, column], column) for column in columns])
         off = [k for k, column in enumerate(columns) if self._is_off(values[:, column], column)]
@@ -237,8 +242,9 @@ class Predictor:
         centre, ahead, behind = np.split(self.predict_all(points), split)
         changes = ahead - centre
         changes[off] = 0.5 * (ahead[off] - behind)
-        changes[~np.isfinite(changes) & np.isfinite(centre)] = 0.0
-        return centre[0], np.moveaxis(changes / moves[:, :, None, None], 0, 1)
+        slopes = changes / moves[:, :, None, None]
+        slopes[~(np.abs(slopes) < UNSTABLE) & np.isfinite(centre)] = 0.0
+        return centre[0], np.moveaxis(slopes, 0, 1)
 
     def _divisions(self, points: Floats) -> Ints:
         """Steps of the integrator in a substep that each point needs, ``(m,)``."""

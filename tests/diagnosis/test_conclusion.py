@@ -65,6 +65,7 @@ def test_a_mechanism_is_enough():
     assert found.base.hypothesis.names == ()
 
 
+@pytest.mark.slow
 def test_a_mechanism_stands_beside_an_unnamed_effect():
     beats = small.effect("pulsating_supply", "oscillation", amplitude=0.175, frequency=5.0)
     name = small.effect("turbulent_resistance", quadratic=10.0)
@@ -91,6 +92,7 @@ def test_scatter_of_the_valves_gain_is_no_missing_physics():
     assert found.noise.sigma[0] == pytest.approx(0.2, rel=0.2)
 
 
+@pytest.mark.slow
 def test_resistance_that_depends_on_volume_is_an_unnamed_effect_among_all_terms():
     found = small.concluded(
         small.made(small.effect("volume_resistance", "R(V)", change=0.65)), small.ALL_TERMS
@@ -110,6 +112,7 @@ def test_resistance_that_depends_on_volume_is_an_unnamed_effect_among_all_terms(
     assert np.polyfit(shown.x, shown.y, 1)[0] * np.ptp(shown.x) > 3.0
 
 
+@pytest.mark.slow
 def test_a_beating_heart_is_at_the_alveolus():
     beats = small.effect("cardiogenic", "oscillation", amplitude=1.3, frequency=1.4)
     found = small.concluded(small.made(beats))
@@ -132,6 +135,7 @@ def test_a_beating_heart_is_at_the_alveolus():
     assert np.ptp(shown.y) == pytest.approx(2.6, rel=0.4)
 
 
+@pytest.mark.slow
 def test_resistance_that_depends_on_direction_is_found_among_all_terms():
     effect = small.effect("direction_resistance", "R(direction)", ratio=2.0)
     found = small.concluded(small.made(effect, samples=60), small.ALL_TERMS)
@@ -140,6 +144,7 @@ def test_resistance_that_depends_on_direction_is_found_among_all_terms():
     assert found.unnamed.name == "R(direction)"
 
 
+@pytest.mark.slow
 def test_a_mechanism_is_enough_among_all_terms():
     effect = small.effect("viscoelasticity", ratio=0.7, time=1.0)
     found = small.concluded(small.made(effect), small.ALL_TERMS)

@@ -160,6 +160,7 @@ def test_noise_of_the_flow_is_no_physics(by_volume):
         assert diagnosis.verdict == "nothing_missing"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "draw"), [(71, 14), (20261130, 7), (777001, 7)])
 def test_a_sound_recording_with_bad_samples_lacks_nothing(seed, draw):
     """Noise sorted samples; a bend of the flow was smoothed away; a label was off by 0.4 %."""

@@ -119,6 +119,7 @@ def test_breaths_at_one_end_are_a_change_of_the_session():
     assert found(session("intermittent_leak", late, conductance=15.0)) is None
 
 
+@pytest.mark.slow
 def test_a_test_lung_does_not_cough():
     breaths = session("cough", pressure=9.0)
     settings = dataclasses.replace(

@@ -150,6 +150,7 @@ def test_a_lung_that_changes_makes_no_effort():
     assert named.column("compliance_drift.change")[0] == pytest.approx(0.35, rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [0.0, 2.5])
 def test_a_late_expiratory_valve_in_closed_loop(drift):
     """It drags no leak along, and stands beside a drift of the sensor."""

@@ -99,9 +99,7 @@ def test_the_noise_is_that_of_the_shape_that_is_freed():
     assert named.noise.sigma[0] == pytest.approx(left.sigma[0], rel=0.05)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="an inertance is named at 0.65: the circuit is too small to be likely"
-)
+@pytest.mark.slow
 def test_a_little_of_what_every_rig_has_is_compared_with_but_not_named():
     """A little circuit before a high resistance explains much; gas with inertia looks like it."""
     turbulent = small.effect("turbulent_resistance", quadratic=10.0)
@@ -159,6 +157,7 @@ def test_a_small_term_that_hides_others_is_compared_with_and_not_named():
     assert set(small.concluded(breaths).names) == {"valve_delay", "valve_curve"}
 
 
+@pytest.mark.slow
 def test_an_effort_that_all_breaths_have_is_not_taken_for_compliance():
     """R and C of the base model make up for the efforts' mean; fits start at the label too."""
     effect = small.effect("patient_effort", "half sine", amplitude=2.5, duration=0.9)

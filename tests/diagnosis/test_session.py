@@ -125,6 +125,7 @@ def test_a_drift_of_the_gain_is_no_step_and_no_drift_of_the_lung():
     assert found.column("gain_drift.change")[0] == pytest.approx(-0.25, abs=0.03)
 
 
+@pytest.mark.slow
 def test_pressure_that_is_late_by_a_sample_makes_no_late_valves():
     """Pattern 3."""
     recorded = small.made()

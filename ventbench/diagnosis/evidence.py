@@ -337,7 +337,6 @@ class _Search:
     def extend(self, chosen: Scored, noise: Noise) -> tuple[CandidateEffects, Noise]:
         """Fit sets with one term more, less or other, and return what they were chosen by."""
         around, names = self.around(chosen.fitted), names_of(chosen.terms)
-        leads = chosen is self.ordered()[0]
         model = self.linear_model(around, chosen.fitted, noise, chosen.terms, loose=True)
         noise = self.evaluator.colour(model.residual_noise)
         if len(names) < self.settings.most_terms:
@@ -348,8 +347,8 @@ class _Search:
         for term in chosen.terms:
             rest = tuple(t for t in chosen.terms if t is not term)
             self.attempt(around, noise, rest, chosen.fitted, new=True)
-            if term.name in basis_terms() or (leads and term.name not in IN_TIME):
-                self.swap(term.name, rest, noise)
+            if term.name in basis_terms():
+                self.name(term.name, rest, noise)
             if term.name in EVENTS and names_of(rest) in self.scored:
                 # The breaths in which it acts, beside the rest.
                 reduced = self.scored[names_of(rest)]
@@ -361,22 +360,17 @@ class _Search:
                 self.attempt(around, noise, (*rest, alternative), self.base, new=True)
         return around, noise
 
-    def swap(self, name: str, rest: Set, noise: Noise) -> None:
-        """Fit the likeliest others in the place of a term of a set.
-
-        In the place of a basis term, which contains them, these are its special cases.
-        """
+    def name(self, unknown: str, rest: Set, noise: Noise) -> None:
+        """Fit the likeliest mechanisms in the place of a basis term that contains them."""
         reduced = self.scored.get(names_of(rest))
         if reduced is None:
             return
         around = self.around(reduced.fitted)
         model = self.linear_model(around, reduced.fitted, noise, rest)
-        others = {
-            n
-            for n in self.names
-            if name not in basis_terms() or name in mechanism(n).description.special_case_of
-        } - {name, *names_of(rest)}
-        terms = [t[0] for _, t in enumerate_sets(model, (), 1, 1) if t and t[0].name in others]
+        special = {
+            n for n in self.names if unknown in mechanism(n).description.special_case_of
+        } - names_of(rest)
+        terms = [t[0] for _, t in enumerate_sets(model, (), 1, 1) if t and t[0].name in special]
         for term in terms[: self.settings.fits - 1]:
             self.attempt(around, noise, (*rest, term), reduced.fitted, new=True)
 

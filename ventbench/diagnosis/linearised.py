@@ -206,13 +206,6 @@ def simulate(
         for point in (screened[name] if name in screened else points(name))
     ]
     acting = {n: [perturb(point) for point in courses(n)] for n in (*CONSTANT, OPEN) if n in events}
-    # What every rig has is small, and a small effect is no share of a large one: a circuit of a
-    # tenth of the compliance rounds edges ten times as sharply.
-    small = {
-        perturb({strength_path(n): _UBIQUITOUS * mechanism(n).description.least}): 1.0
-        for n in candidates
-        if mechanism(n).description.ubiquitous
-    }
     predicted = predictor.predict_all(np.stack(perturbed))[:, :, 0]
     # a point that the model cannot simulate changes nothing, so no evidence chooses it
     predicted = np.where(
@@ -223,7 +216,7 @@ def simulate(
     ]
     courses_of = {name: np.stack([columns[k] for k in indices]) for name, indices in acting.items()}
     effects = CandidateEffects(data, values, columns, basis, of_basis, {}, (), courses_of)
-    terms, least = [], dict(small)
+    terms, least = [], {}
     places = np.unique(data.position)
     between = (0.5 * (places[1:] + places[:-1])[1:-1]).tolist()
     for name, point, k in evaluations:
@@ -246,9 +239,9 @@ def simulate(
             terms.append(replace(term, main=(len(columns) - 1,), values=point | {at[0]: x}))
         if not at:
             terms.append(replace(term, forms=effects.forms(columns[k], name)))
-            is_first = not any(t.name == name for t in terms[:-1])
-            if description.least and is_first and not description.ubiquitous:
-                least[k] = _LEAST * description.least / abs(size)
+            if description.least and not any(t.name == name for t in terms[:-1]):
+                share = _UBIQUITOUS if description.ubiquitous else _LEAST
+                least[k] = share * description.least / abs(size)
     terms += [
         Term(name, [basis[j][1] for j in indices], tuple(indices))
         for name, indices in of_basis.items()

@@ -133,14 +133,16 @@ def _swapped(named: frozenset[str], found: Mapping[str, Any]) -> dict[frozenset[
 
     Held-out breaths accept what is named; they do not choose between it and its rivals.
     """
-    weights = {frozenset(each["terms"]): each["probability"] for each in found["posterior"]}
-    if named not in weights:
-        return {named: 1.0}
-    odds = {named: weights[named]}
+    sets = [(each["terms"], each["probability"]) for each in found["posterior"]]
+
+    def weight(name: str, rival: str) -> float:
+        return sum(p for terms, p in sets if name in terms and rival not in terms)
+
+    odds = {named: 1.0}
     for missing in found["mechanisms"]:
+        name = missing["name"]
         for other in missing["alternatives"]:
-            swapped = named - {missing["name"]} | {other}
-            odds[swapped] = weights.get(swapped, 0.0)
+            odds[named - {name} | {other}] = weight(other, name) / (weight(name, other) or np.inf)
     total = sum(odds.values())
     return {names: each / total for names, each in odds.items()}
 

@@ -127,16 +127,20 @@ def test_the_posterior_is_passed_on_beside_what_held_out_breaths_accept() -> Non
     assert changed[terms("gain_step", "saturation")] == pytest.approx(sure)
 
 
-def test_a_rival_of_an_effect_of_some_breaths_has_its_share() -> None:
+@pytest.mark.parametrize("searched", [{"valve_lag"}, set()])
+def test_a_rival_of_an_effect_of_some_breaths_has_its_share(searched: set[str]) -> None:
+    """Whether the search has found what held-out breaths accept beside it, or not."""
     share = (1.0 - CALIBRATION.unsure) * CALIBRATION.accepted
-    lag = frozenset({"valve_lag"})
     lost = named("lost_commands", 0.6, "late_commands", affected=[2, 5])
-    beside = with_effect({lag: 1.0}, "lost_commands", 0.6, ["late_commands"])
+    lag = named("valve_lag", 0.4, "valve_delay")
+    beside = with_effect({frozenset(searched): 1.0}, "lost_commands", 0.6, ["late_commands"])
     weighed = [{"terms": list(each), "probability": p} for each, p in beside.items()]
-    answer = told("named", mechanisms=[lost, named("valve_lag", 0.4)], posterior=weighed)
+    answer = told("named", mechanisms=[lost, lag], posterior=weighed)
     for effect, confidence in (("lost_commands", 0.6), ("late_commands", 0.4)):
-        searched = (1.0 - CALIBRATION.unsure) * (1.0 - CALIBRATION.accepted) * confidence
-        assert answer[lag | {effect}] == pytest.approx(confidence * share + searched)
+        posterior = (1.0 - CALIBRATION.unsure) * (1.0 - CALIBRATION.accepted) * confidence
+        expected = confidence * share + ("valve_lag" in searched) * posterior
+        assert answer[terms(effect, "valve_lag")] == pytest.approx(expected)
+    assert not answer.get(terms("lost_commands", "valve_delay"))  # its share is the posterior's
 
 
 def test_rivals_of_a_name_share_what_held_out_breaths_accept() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -196,14 +197,21 @@ def diagnose(
 def with_effect(
     weights: Mapping[frozenset[str], float], name: str, confidence: float, rivals: Sequence[str]
 ) -> dict[frozenset[str], float]:
-    """Posterior of sets beside an effect of some breaths, or beside one of its rivals."""
+    """Posterior of sets beside an effect of some breaths, or beside one of its rivals.
+
+    Args:
+        weights: probabilities of sets of what acts in all breaths.
+        name: the effect.
+        confidence: its probability.
+        rivals: effects that share the rest; none of them if there is none.
+    """
     others: list[frozenset[str]] = [frozenset({rival}) for rival in rivals] or [frozenset()]
     shares = {frozenset({name}): confidence}
     shares |= dict.fromkeys(others, (1.0 - confidence) / len(others))
-    joined: dict[frozenset[str], float] = {}
+    joined: dict[frozenset[str], float] = defaultdict(float)
     for names, weight in weights.items():
         for effect, share in shares.items():
-            joined[names | effect] = joined.get(names | effect, 0.0) + weight * share
+            joined[names | effect] += weight * share
     return joined
 
 

@@ -30,8 +30,8 @@ Ints = NDArray[np.int_]
 #: Path of the reading that a breath starts from, cmH2O; it is no parameter of the model.
 START = "start"
 
-#: Change of a reading, cmH2O or mL/s, by a unit of any parameter that is none of a rig: a jump of
-#: 3 L/s within 10 ms is 3e5 a second of delay. What exceeds it has diverged.
+#: A reading, cmH2O or mL/s, or its change by a unit of any parameter, that is none of a rig: a jump
+#: of 3 L/s within 10 ms is 3e5 a second of delay. What exceeds it has diverged.
 UNSTABLE = 1e7
 
 #: Numbers of simulations to compile for, unless told otherwise: the least that holds all breaths,

@@ -38,11 +38,12 @@ from ventbench.base.interval import Interval
 DRAWS, SEED = 1000, 0
 
 
-def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
+def with_error(errors: Floats) -> tuple[Floats, Floats, Floats]:
     """Mean over cells of repeats, its standard error and degrees of freedom, ``(...)`` each.
 
     Errors have shape ``(..., cells, repeats)``; of one repeat there is no standard error, with no
-    degree of freedom. Where none differs it is 0.
+    degree of freedom. Where none differs it is 0. Mountings are the repeats of one cell where the
+    lungs are mounted anew.
     """
     *_, cells, repeats = errors.shape
     mean = errors.mean(axis=(-1, -2))
@@ -52,16 +53,6 @@ def as_mounted(errors: Floats) -> tuple[Floats, Floats, Floats]:
     total = variance.sum(axis=-1)
     freedom = total**2 / np.maximum((variance**2).sum(axis=-1) / (repeats - 1), 1e-300)
     return mean, np.sqrt(total), np.maximum(freedom, 1.0)
-
-
-def mounted_anew(by_mounting: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean over mountings, the last axis, its standard error (one has none), and its freedom."""
-    count = by_mounting.shape[-1]
-    mean = by_mounting.mean(axis=-1)
-    if count < 2:
-        return mean, np.full(mean.shape, np.nan), np.zeros(mean.shape)
-    error = by_mounting.std(axis=-1, ddof=1) / math.sqrt(count)
-    return mean, error, np.full(mean.shape, count - 1.0)
 
 
 #: Rank correlations of two orders, by the names of a trial.
@@ -185,10 +176,10 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
     count, pips, repeats = errors.shape
 
     def by_mounting(values: Floats) -> dict[str, Interval]:
-        each = np.stack(as_mounted(values), axis=1)
+        each = np.stack(with_error(values), axis=1)
         return {name: interval(*x) for name, x in zip(mountings, each, strict=True)}
 
-    apart, error, _ = as_mounted(errors - simulated[..., None])
+    apart, error, _ = with_error(errors - simulated[..., None])
     within = between = math.nan
     if repeats > 1:
         within = float(np.sqrt(errors.var(axis=-1, ddof=1).mean()))
@@ -197,10 +188,10 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
     done = np.isfinite(errors).sum(axis=(1, 2))
     share = stats.binomtest(int(done.sum()), errors.size).proportion_ci(method="exact")
     return EntryTrial(
-        interval(*as_mounted(errors.reshape(-1, repeats))),
+        interval(*with_error(errors.reshape(-1, repeats))),
         by_mounting(errors),
         dict(zip(mountings, simulated.mean(axis=1).tolist(), strict=True)),
-        interval(*mounted_anew(apart)),
+        interval(*with_error(apart[None])),
         by_mounting(errors - simulated[..., None]),
         Interval(float(done.sum()) / errors.size, float(share.low), float(share.high)),
         {name: (int(n), pips * repeats) for name, n in zip(mountings, done, strict=True)},

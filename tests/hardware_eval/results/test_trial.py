@@ -17,9 +17,8 @@ from hardware_eval.results.trial import (
     Floats,
     agreement,
     analyse,
-    as_mounted,
     correlation,
-    mounted_anew,
+    with_error,
 )
 from ventbench.base.errors import InputError
 from ventbench.task import protocol
@@ -45,14 +44,14 @@ def covered(found: tuple[Floats, Floats, Floats], truth: Any) -> float:
 
 def test_intervals_cover_the_truth_in_nineteen_of_twenty_trials() -> None:
     gaps, cells = trials(2000, np.random.default_rng(0), np.array(0.3))
-    anew = covered(mounted_anew(gaps.mean(axis=(2, 3))), 0.3)
-    mounted = covered(as_mounted(gaps.reshape(2000, -1, REPEATS)), cells.mean(axis=(1, 2)))
-    by_lung = covered(as_mounted(gaps), cells.mean(axis=2))
+    anew = covered(with_error(gaps.mean(axis=(2, 3))[:, None]), 0.3)
+    mounted = covered(with_error(gaps.reshape(2000, -1, REPEATS)), cells.mean(axis=(1, 2)))
+    by_lung = covered(with_error(gaps), cells.mean(axis=2))
     # 95 % of 2000 have a standard error of 0.5 %; of few degrees of freedom t is an approximation.
     for share in (anew, mounted, by_lung):
         assert 0.935 <= share <= 0.965
     # Who takes runs for independent covers a new mounting far too rarely.
-    assert covered(as_mounted(gaps.reshape(2000, -1, REPEATS)), 0.3) < 0.5
+    assert covered(with_error(gaps.reshape(2000, -1, REPEATS)), 0.3) < 0.5
 
 
 def test_the_interval_of_rank_agreement_covers_that_of_the_true_means() -> None:

@@ -282,13 +282,17 @@ class Watched:
         if self.ended:
             return None
         late = max(began - self._deadline, 0.0)
-        sample = sample_of(reading, began, self.last, self.pip, late)
+        pressure, flow, applied = (math.nan,) * 3
+        if reading is not None:
+            pressure, flow, applied = reading.pressure, reading.flow, reading.u_in
+        answered = reading is not None
+        sample = SafetySample(began, pressure, flow, *self.last, self.pip, late, applied, answered)
         log.time.append(began - self._start)
-        log.pressure.append(sample.pressure)
-        log.flow.append(sample.flow)
+        log.pressure.append(pressure)
+        log.flow.append(flow)
         log.target.append(target)
         log.late.append(late)
-        self.answered.append(sample.answered)
+        self.answered.append(answered)
         if reading is not None and reading.flags & _CAUSES:
             self._vented_by_device(reading.flags)
             return None
@@ -371,44 +375,37 @@ def run_once(
         LinkError: if the port goes away or the device is silent; it vents by itself.
         EmergencyStop: if the operator pressed the key; the lung is vented.
     """
-    loop = _Loop(bench, run, controller, on_breath)
-    try:
-        return loop.run()
-    finally:
-        loop.vent()
+    return _Loop(bench, run, controller).run(on_breath)
 
 
 class _Loop(Watched):
     """The state of one run."""
 
-    def __init__(
-        self,
-        bench: Bench,
-        run: PlannedRun,
-        controller: LiveController,
-        on_breath: Callable[[int, BreathLog], None],
-    ) -> None:
+    def __init__(self, bench: Bench, run: PlannedRun, controller: LiveController) -> None:
         super().__init__(bench, run.lung, run.pip)
-        self._run, self._controller, self._on_breath = run, controller, on_breath
+        self._run, self._controller = run, controller
         self._fallback = fallback.FallbackState(self._lung)
         self._breaths: list[BreathLog] = []
         self._asked = self._late_answers = self._limited = 0
         self._disturbed = False
 
-    def run(self) -> RunResult:
-        """All breaths."""
-        with undisturbed():
-            self.begin()
-            for breath in range(protocol.BREATHS):
-                if self.ended:
-                    break
-                self.log = BreathLog()
-                self._breaths.append(self.log)
-                for step in range(protocol.BREATH_STEPS):
-                    self._step(breath, step)
+    def run(self, on_breath: Callable[[int, BreathLog], None]) -> RunResult:
+        """All breaths; see :func:`run_once`."""
+        try:
+            with undisturbed():
+                self.begin()
+                for breath in range(protocol.BREATHS):
                     if self.ended:
                         break
-                self._on_breath(breath, self.log)
+                    self.log = BreathLog()
+                    self._breaths.append(self.log)
+                    for step in range(protocol.BREATH_STEPS):
+                        self._step(breath, step)
+                        if self.ended:
+                            break
+                    on_breath(breath, self.log)
+        finally:
+            self.vent()
         ended = self.ended or self._measured()
         if self._disturbed:
             self._bench.operator.disturb(self._run.perturbation, False)
@@ -517,15 +514,6 @@ _CAUSES = CAUSES & ~Flag.HOST_VENTED
 
 
 _HELD_UP = Flag.COMMANDS_STOPPED | Flag.DEVICE_LATE
-
-
-def sample_of(
-    reading: Reading | None, began: float, command: tuple[float, int], pip: float, late: float
-) -> SafetySample:
-    """What the checks see of a reading, or of its absence, under a command."""
-    if reading is None:
-        return SafetySample(began, math.nan, math.nan, *command, pip, late, answered=False)
-    return SafetySample(began, reading.pressure, reading.flow, *command, pip, late, reading.u_in)
 
 
 def shown(reading: Reading | None) -> float:

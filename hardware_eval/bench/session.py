@@ -7,13 +7,16 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
-from hardware_eval.bench.controllers import ControllerFailedError, MakeController, control_pid
-from hardware_eval.bench.fallback import FallbackSettings
+from hardware_eval.bench.controllers import (
+    ControllerFailedError,
+    Lateness,
+    MakeController,
+    control_pid,
+)
 from hardware_eval.bench.loop import (
-    REST_S,
     Bench,
     BreathLog,
     EmergencyStop,
@@ -23,7 +26,6 @@ from hardware_eval.bench.loop import (
 )
 from hardware_eval.bench.plan import CONTROL, Plan, PlannedRun, progress
 from hardware_eval.bench.raw_log import RawLog, lines
-from hardware_eval.bench.safety import SafetySettings
 from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
 from hardware_eval.wire.client import Client, LinkError
@@ -225,11 +227,7 @@ def _ended(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[str,
 
 
 def dry_run(
-    plan: Plan,
-    make_controller: MakeController,
-    settings: SafetySettings,
-    rest: float = REST_S,
-    fallback: FallbackSettings | None = None,
+    bench: Bench, plan: Plan, make_controller: MakeController
 ) -> tuple[list[str], list[tuple[str, str, float, float]]]:
     """Run every distinct run of a plan once on the frozen simulators, by the code of a bench.
 
@@ -237,11 +235,9 @@ def dry_run(
     for the same time.
 
     Args:
+        bench: whose safety, rest and fallback are those of the dry run; it is not touched.
         plan: what is to run on the bench.
         make_controller: makes the controller of a run.
-        settings: of the safety.
-        rest: time at rest before each run, s.
-        fallback: takes over as it will on the bench.
 
     Returns:
         What went wrong, one sentence each, empty if the plan is safe there; and entry, lung, PIP
@@ -256,13 +252,20 @@ def dry_run(
         device = LoopbackDevice(simulated_lung(lung))
         client = Client(device, device.clock)
         client.hello()
-        bench = Bench(client, device.clock, settings, Operator(), (), rest, fallback)
+        virtual = replace(
+            bench,
+            client=client,
+            clock=device.clock,
+            operator=Operator(),
+            shows=(),
+            lateness=Lateness(),
+        )
         distinct: dict[tuple[str, float], PlannedRun] = {}
         for run in plan.runs:
             if run.lung == lung and run.kind != "perturbed":
                 distinct.setdefault((run.entry, run.pip), run)
         for run in distinct.values():
-            result = _one(bench, run, {}, make_controller, lambda line: None, (0, 0))
+            result = _one(virtual, run, {}, make_controller, lambda line: None, (0, 0))
             if result.status != "complete":
                 problems.append(f"{run.entry} on {lung} at PIP {run.pip:g}: {result.reason}")
             elif run.kind != "control":

@@ -292,20 +292,17 @@ def evaluate(
             "nobody can disturb the tube of an emulator in another process: leave `perturb` out of "
             "the plan, or use a port such as virtual:R20C20, which disturbs it by itself"
         )
+    left_out = chosen_parts(how.skip)
     settings = SafetySettings(largest_u_in=how.largest_u_in, largest_rise=how.largest_rise)
-    fallback, left_out = FALLBACK if how.fallback else None, chosen_parts(how.skip)
+    fallback = FALLBACK if how.fallback else None
+    bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, fallback)
     runner = make_runner(sandbox)
     log_path = out / LOG
     simulated: list[tuple[str, str, float, float]] = []
     if how.dry_run and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
-        problems, simulated = session.dry_run(
-            plan,
-            controllers(submissions, plan.track, runner, real_time=False),
-            settings,
-            how.rest,
-            fallback,
-        )
+        make = controllers(submissions, plan.track, runner, real_time=False)
+        problems, simulated = session.dry_run(bench, plan, make)
         if problems:
             raise InputError(
                 "the dry run on the simulators stopped: " + "; ".join(problems) + ". Nothing was "
@@ -324,7 +321,6 @@ def evaluate(
         "sandbox": None if runner.sandbox is None else dict(runner.sandbox),
         "simulated": simulated,
     }
-    bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, fallback)
 
     def tested(lung: str) -> Sheet | None:
         if not how.selftest:

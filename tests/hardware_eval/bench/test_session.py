@@ -333,19 +333,18 @@ def test_an_operator_who_does_not_confirm_ends_the_session(
     assert "confirm" in ended
 
 
-def test_a_dry_run_finds_a_controller_that_is_unsafe(plan: Plan) -> None:
+def test_a_dry_run_finds_a_controller_that_is_unsafe(bench: Bench) -> None:
     calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
-    problems, errors = session.dry_run(calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT)
+    problems, errors = session.dry_run(bench, calm, lambda run: Scripted(lambda step, u: 100.0))
     assert len(problems) == 1
     assert "over pressure" in problems[0]
     assert errors == []
 
 
-def test_the_dry_run_has_the_fallback_of_the_run() -> None:
+def test_the_dry_run_has_the_fallback_of_the_run(bench: Bench) -> None:
     calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
-    problems, _ = session.dry_run(
-        calm, lambda run: Scripted(lambda step, u: 100.0), DEFAULT, fallback=FallbackSettings()
-    )
+    guarded = replace(bench, fallback=FallbackSettings())
+    problems, _ = session.dry_run(guarded, calm, lambda run: Scripted(lambda step, u: 100.0))
     assert len(problems) == 1
     assert "were outside the envelope" in problems[0]
 

@@ -7,7 +7,6 @@ without a score, a no-go); 2 bad input or no device.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import secrets
 import sys
 import time
@@ -35,7 +34,7 @@ from hardware_eval.commands import (
 from ventbench.base import files
 from ventbench.base.text import number, plain
 from ventbench.cli import options
-from ventbench.cli.options import JsonFile, emit
+from ventbench.cli.options import JsonFile
 
 #: What options are called now, by their former names.
 FORMER = {
@@ -146,32 +145,27 @@ def run(
             calibration=calibrated,
         )
     reason = masked.hidden(done.reason)
-    emit(
-        {
-            "complete": not (reason or done.stopped),
-            "reason": reason,
-            "log": str(done.log),
-            "recording": None if done.recording is None else str(done.recording),
-            "records": {name: str(path) for name, path in done.records.items()},
-            "stopped": dict(done.stopped),
-        },
-        json,
-    )
-    shown = told(json)
+    complete, lines = not (reason or done.stopped), list[str]()
     if reason:
-        print(f"stopped: {plain(reason)}; {line.client.ending()}", file=shown)
-        print(f"what is done is in {done.log}; the same command continues", file=shown)
-        raise typer.Exit(1)
+        lines.append(f"stopped: {plain(reason)}; {line.client.ending()}")
+        lines.append(f"what is done is in {done.log}; the same command continues")
     for name, path in done.records.items():
         if name in masked.called:
-            print(f"{masked.called[name]} is {name}", file=shown)
-        print(f"{name}: record {path}", file=shown)
+            lines.append(f"{masked.called[name]} is {name}")
+        lines.append(f"{name}: record {path}")
         if name in done.stopped:
-            print(f"{name}: no score: {plain(done.stopped[name])}", file=shown)
+            lines.append(f"{name}: no score: {plain(done.stopped[name])}")
         if name not in done.unrun:
-            print(f"next: ventbench board add {path}", file=shown)
-    if done.stopped:
-        raise typer.Exit(1)
+            lines.append(f"next: ventbench board add {path}")
+    about = {
+        "complete": complete,
+        "reason": reason,
+        "log": done.log,
+        "recording": done.recording,
+        "records": done.records,
+        "stopped": done.stopped,
+    }
+    show(about, json, *lines, ok=complete)
 
 
 @app.command()
@@ -268,7 +262,7 @@ def conformance(
     from hardware_eval.wire import conformance as judge
 
     shown = told(json)
-    line = ev.connect(port, timeout=1.0)  # how long answers take is a clause of its own
+    line = ev.connect(port)
     transport = line.client.transport
     try:
         clauses = judge.conformance(
@@ -279,7 +273,7 @@ def conformance(
     counts = Counter(clause.holds for clause in clauses)
     failed = counts[False]
     show(
-        {"holds": not failed, "clauses": [dataclasses.asdict(clause) for clause in clauses]},
+        {"holds": not failed, "clauses": clauses},
         json,
         f"{counts[True]} hold, {failed} fail, {counts[None]} not tried",
         ok=not failed,
@@ -380,7 +374,7 @@ def collect(
                 about={"device": ev.device_about(line)},
                 progress=lambda number: exploring(number, breaths),
             )
-    count, recording = len(explored), str(out / RECORDING)
+    count, recording = len(explored), out / RECORDING
     lines = [f"{count} whole breaths: {recording}"]
     if stopped:
         lines.append(f"stopped: {plain(stopped)}; {line.client.ending()}")
@@ -442,7 +436,7 @@ def replay(
     from hardware_eval.results.record import replay as run_replay
 
     report = run_replay(log, record=record, rerun=rerun, mcap=mcap)
-    show(report.as_dict(), json, report, ok=not report.problems)
+    show(report, json, report, ok=not report.problems)
 
 
 app.command()(bringup)

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO
 
+import msgspec
 import typer
 
 from ventbench.base import files
@@ -44,10 +45,12 @@ def told(json: Path | None) -> TextIO:
 def show(value: object, json: Path | None, *lines: object, ok: bool = True) -> None:
     """Write the result of a command to the file of ``--json``, and lines for people.
 
+    The result may hold dataclasses and paths; a number that is not finite becomes null.
+
     Raises:
         typer.Exit: with code 1 if the answer is no.
     """
-    emit(value, json)
+    emit(files.json_values(msgspec.to_builtins(value, enc_hook=str)), json)
     print(*lines, sep="\n", file=told(json))
     if not ok:
         raise typer.Exit(1)
@@ -120,7 +123,7 @@ def trial(
     from hardware_eval.results.trial import analyse
 
     done = analyse(sessions)
-    show(done.as_dict(), json, done)
+    show(done, json, done)
 
 
 def report(
@@ -133,9 +136,9 @@ def report(
     """
     from hardware_eval.results import acceptance, page
 
-    written = {"session": str(page.write(session))}
+    written = {"session": page.write(session)}
     try:
-        written["acceptance"] = str(acceptance.write(session))
+        written["acceptance"] = acceptance.write(session)
     except InputError as error:  # no run is complete yet
         print(error, file=told(json))
     show(written, json, *written.values())
@@ -187,7 +190,7 @@ def calibrate(
     if dropped:
         lines.append(f"measured by the readings of before, measure again: {', '.join(dropped)}")
     show(
-        {"part": part, "fit": vars(made.fit), "file": str(out), "sha256": saved.sha256},
+        {"part": part, "fit": made.fit, "file": out, "sha256": saved.sha256},
         json,
         *lines,
         f"readings are corrected to {saved.correction()}",

@@ -32,7 +32,7 @@ from hardware_eval.bench.selftest import Sheet, chosen_parts, selftest
 from hardware_eval.realtime import ENTRY_PRIORITY, Clock, RealClock
 from hardware_eval.results import acceptance, page
 from hardware_eval.results import record as records
-from hardware_eval.wire.client import ANSWER_TIMEOUT, Client, Link
+from hardware_eval.wire.client import Client, Link
 from hardware_eval.wire.messages import Capability
 from ventbench.base import files
 from ventbench.base.errors import InputError
@@ -140,10 +140,8 @@ def _await(port: str) -> None:
         looks -= 1
 
 
-def connect(port: str, confirmed: bool = True, timeout: float = ANSWER_TIMEOUT) -> Line:
+def connect(port: str, confirmed: bool = True) -> Line:
     """Open a port, and a session; a real device must have been brought up, if it shall be so.
-
-    An answer may take ``timeout``, s.
 
     It is a serial port or socket, in real time; or ``virtual:R20C50``, an emulated lung in this
     process on a virtual clock, where breaths take a fraction of a second.
@@ -154,7 +152,7 @@ def connect(port: str, confirmed: bool = True, timeout: float = ANSWER_TIMEOUT) 
     """
     transport, clock = carrier(port)
     kind = port_kind(port)
-    client = Client(transport, clock, timeout, emulated=kind in EMULATED_PORTS)
+    client = Client(transport, clock, emulated=kind in EMULATED_PORTS)
     try:
         client.hello()
         found = {} if client.simulated or not confirmed else bringup.load(client)

@@ -256,10 +256,6 @@ class Replay:
     timing: dict[str, float]  #: statistics of the loop, see :func:`timing`.
     problems: tuple[str, ...]  #: where the record and the log differ; empty without a record.
 
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return files.json_values(dataclasses.asdict(self))
-
     def __str__(self) -> str:
         steps = (
             "{steps} steps, {on_time:.2%} within 2 ms, latest {worst:.4f} s, {lost} lost, "

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,6 @@ from scipy import stats
 
 from hardware_eval.bench.identity import interval
 from hardware_eval.bench.raw_log import read_session
-from ventbench.base import files
 from ventbench.base.arrays import Floats
 from ventbench.base.errors import InputError
 from ventbench.base.interval import Interval
@@ -118,10 +117,6 @@ class Trial:
     #: rank agreement of the entries with a score; empty for fewer than two.
     agreement: dict[str, Interval]
     missing: tuple[str, ...]  #: why something could not be said.
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return files.json_values(asdict(self))
 
     def __str__(self) -> str:
         rows = []

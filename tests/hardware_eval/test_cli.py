@@ -198,6 +198,17 @@ def test_wrong_numbers_and_ports_are_bad_input(
         assert said in capsys.readouterr().err
 
 
+def test_a_calibrated_part_is_written_as_json(on_line: Line, tmp_path: Path) -> None:
+    out, result = tmp_path / "calibration.json", tmp_path / "result.json"
+    line = f"calibrate peep --port p --lung R5C20 --yes --out {out} --json {result}"
+    done = invoke(*shlex.split(line))
+    assert done.exit_code == 0, done.output
+    told = json.loads(result.read_text())
+    assert told["fit"]["intercept"]["value"] == pytest.approx(5.0, abs=0.1)
+    assert told["fit"]["slope"]["value"] is None
+    assert told["file"] == str(out)
+
+
 def test_the_manual_lists_every_key_of_a_plan(tmp_path: Path) -> None:
     (block,) = re.findall(r"^```toml\n(.*?)^```", MANUAL.read_text("utf-8"), re.M | re.S)
     path = tmp_path / "plan.toml"

@@ -12,6 +12,7 @@ from scipy import stats
 
 from hardware_eval.bench.plan import make_plan
 from hardware_eval.bench.raw_log import RawLog
+from hardware_eval.commands import show
 from hardware_eval.results.trial import (
     CORRELATIONS,
     Floats,
@@ -115,7 +116,9 @@ def test_a_log_gives_gaps_success_and_what_is_missing(tmp_path: Path) -> None:
     assert any("fast has no score" in text for text in done.missing)
     assert any("mounted anew" in text for text in done.missing)
     assert done.agreement == {}
-    assert json.loads(json.dumps(done.as_dict()))["entries"]["fast"]["score"]["value"] is None
+    path = tmp_path / "trial.json"
+    show(done, path)
+    assert json.loads(path.read_text())["entries"]["fast"]["score"]["value"] is None
 
 
 def test_sessions_of_one_trial_are_mountings_and_others_are_refused(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ from typing import Any
 
 import msgspec
 
-from hardware_eval.emulation.cases import encrypt, random_generator, unseal
+from hardware_eval.emulation.cases import random_generator
 from proofs.challenge.generators import GENERATORS
 from proofs.challenge.questions import DrawnCase
+from proofs.challenge.seal import encrypt, unseal
 from ventbench.base import files
 from ventbench.base.errors import InputError
 

@@ -10,11 +10,12 @@ from typing import Literal
 
 import numpy as np
 
-from hardware_eval.emulation.cases import Case, commitment, encrypt, random_generator
+from hardware_eval.emulation.cases import Case, random_generator
 from proofs.challenge.detectability import log_likelihood_loss
 from proofs.challenge.folder import ChallengeFolder, Withheld, encode_answers
 from proofs.challenge.generators import generator, generator_of
 from proofs.challenge.questions import DrawnCase, Kind
+from proofs.challenge.seal import commitment, encrypt
 from ventbench.base import files
 from ventbench.base.arrays import Bools, runs
 from ventbench.base.errors import InputError

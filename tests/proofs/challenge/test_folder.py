@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from hardware_eval.emulation.cases import commitment, encrypt, random_generator, unseal
+from hardware_eval.emulation.cases import random_generator
 from proofs.challenge.folder import decode_answers, encode_answers
 from proofs.challenge.generators import FIRST, GENERATORS
+from proofs.challenge.seal import commitment, encrypt, unseal
 from ventbench.base.errors import InputError
 
 

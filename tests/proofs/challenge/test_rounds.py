@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from hardware_eval.emulation.cases import commitment, unseal
 from proofs.__main__ import app
 from proofs.challenge import reveal as reveal_module
 from proofs.challenge.answer import answer
@@ -19,6 +18,7 @@ from proofs.challenge.folder import ChallengeFolder
 from proofs.challenge.make import make, record_within_limits
 from proofs.challenge.reveal import reveal
 from proofs.challenge.run import Diagnoser, Limits, find, run
+from proofs.challenge.seal import commitment, unseal
 from ventbench.base.errors import InputError
 from ventbench.recordings import load
 

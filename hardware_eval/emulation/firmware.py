@@ -20,15 +20,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cobs import cobs
-
 from hardware_eval.device.program import Hal
 from hardware_eval.wire.messages import (
     FLOW_STEPS,
     PRESSURE_STEPS,
     U_IN_STEPS,
     Flag,
-    checked,
+    content_of,
     fixed_point,
     to_frame,
     with_crc,
@@ -159,8 +157,8 @@ class Firmware:
             while data := self._bus[0].recv(4096):
                 *frames, rest = (rest + data).split(b"\0")
                 for frame in frames:
-                    order = _content(frame)
-                    if order is not None and len(order) == _ORDER.size:
+                    order = content_of(frame)
+                    if isinstance(order, bytes) and len(order) == _ORDER.size:
                         kind, time_us, u_in, u_out = _ORDER.unpack(order)
                         if kind == b"?":
                             self._send(self._identity)
@@ -172,14 +170,6 @@ class Firmware:
                         flow = fixed_point(sample.flow, FLOW_STEPS)
                         self._send(_SAMPLE.pack(b"S", pressure, flow, sample.saturated, count))
         self.lost = not self._ended.is_set()
-
-
-def _content(frame: bytes) -> bytes | None:
-    """What is in the bytes between two zeros; None if it is no frame."""
-    try:
-        return checked(cobs.decode(frame)) if frame else None
-    except cobs.DecodeError:
-        return None
 
 
 def command_of(image: Path) -> list[str]:
@@ -199,15 +189,8 @@ def command_of(image: Path) -> list[str]:
         raise InputError(
             f"--firmware {image}: {_EMULATOR} is not installed (Debian: apt install {_EMULATOR})"
         )
-    lines = [
-        part
-        for line in ("host", "bus")
-        for part in (
-            "-chardev",
-            f"socket,id={line},fd={{{line}}}",
-            "-serial",
-            f"chardev:{line}",
-        )
-    ]
+    lines: list[str] = []
+    for line in ("host", "bus"):
+        lines += ["-chardev", f"socket,id={line},fd={{{line}}}", "-serial", f"chardev:{line}"]
     machine = ["-M", "mps2-an385", "-display", "none", "-monitor", "none"]
     return [_EMULATOR, *machine, *lines, "-kernel", str(image)]

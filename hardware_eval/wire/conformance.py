@@ -298,21 +298,19 @@ def _pressure(host: Probe) -> None:
 
 
 def _watchdog(
-    host: Probe, feed: Callable[[Probe], object] | None = None, armed_only: bool = False
+    host: Probe,
+    begin: Callable[[Probe], object] = Probe.inspire,
+    feed: Callable[[Probe], object] = lambda host: None,
 ) -> None:
     """The device vents between the watchdog's time and its bound after the last command."""
     before = host.counters().watchdog
-    if armed_only:
-        host.arm()
-    else:
-        host.inspire()
+    begin(host)
     first, host.fed = host.fed, math.inf  # it vents on purpose
     last = host.clock.now()  # the device took it before
     lived = False
     while True:
         asked = host.clock.now()
-        if feed is not None:
-            feed(host)
+        feed(host)
         reading = host.reading()
         if reading.mode is Mode.RUNNING:
             if asked > last + BOUND:
@@ -325,9 +323,7 @@ def _watchdog(
         else:
             break
         host.clock.sleep_until(asked + 0.004)
-    if not lived:
-        raise LateError
-    if Flag.DEVICE_LATE in reading.flags:
+    if not lived or Flag.DEVICE_LATE in reading.flags:
         raise LateError
     _vented(reading, "after silence", Flag.COMMANDS_STOPPED)
     equal("counter watchdog", host.counters().watchdog - before, 1)
@@ -396,8 +392,11 @@ CLAUSES: tuple[tuple[str, Callable[[Probe], None]], ...] = (
     ("arming again closes the inspiratory valve (messages)", _rearm),
     ("pressure above the session's limit bars arming (duty 2)", _pressure),
     ("vented in time after the last command (duty 2)", _watchdog),
-    ("vented in time after arming (duty 2)", lambda h: _watchdog(h, armed_only=True)),
-    ("refused messages do not feed the watchdog (duty 2)", lambda h: _watchdog(h, _restless)),
+    ("vented in time after arming (duty 2)", lambda host: _watchdog(host, Probe.arm)),
+    (
+        "refused messages do not feed the watchdog (duty 2)",
+        lambda host: _watchdog(host, feed=_restless),
+    ),
     ("commands feed the watchdog (duty 2)", _feeds),
     ("readings carry the device's time (messages)", _time),
     ("answers come within 5 ms (duty 6)", _answers),

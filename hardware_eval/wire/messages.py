@@ -253,10 +253,6 @@ class Packet:
     message: Message  #: the message.
 
 
-class MalformedPacketError(ValueError):
-    """An intact packet is of unknown kind, of wrong length, or holds no value of its type."""
-
-
 def microseconds(time: float) -> int:
     """Device time, s, as :attr:`Reading.time` goes over the wire."""
     return round(time * 1e6)
@@ -375,27 +371,15 @@ def with_crc(content: bytes) -> bytes:
     return content + _CRC.pack(crc32(content))
 
 
-def checked(packet: bytes) -> bytes | None:
-    """Return the content of a packet if its CRC-32 is right, else None."""
-    content, check = packet[: -_CRC.size], packet[-_CRC.size :]
-    intact = len(packet) >= _HEADER.size + _CRC.size and _CRC.unpack(check)[0] == crc32(content)
-    return content if intact else None
-
-
 def decode(content: bytes) -> Packet:
     """Decode header and body of an intact packet.
 
     Raises:
-        MalformedPacketError: if the kind is unknown, the length wrong, or a value not of its type.
+        ValueError: if the kind is unknown, or a value not of its type.
+        struct.error: if the length is wrong.
     """
     number, session, sequence = _HEADER.unpack_from(content)
-    body = content[_HEADER.size :]
-    try:
-        return Packet(session, sequence, _message(Kind(number), body))
-    except (struct.error, ValueError) as error:
-        raise MalformedPacketError(
-            f"kind 0x{number:02x} with a body of {len(body)} bytes: {error}"
-        ) from error
+    return Packet(session, sequence, _message(Kind(number), content[_HEADER.size :]))
 
 
 def _struct(layout: tuple[_Coded, ...]) -> struct.Struct:
@@ -462,15 +446,22 @@ def feed_bytes(kept: Kept, data: bytes) -> tuple[Kept, list[Event]]:
     return kept, events
 
 
-def _finished(frame: bytes) -> Event:
+def content_of(frame: bytes) -> bytes | Fault:
+    """What the bytes between two zero bytes hold but their CRC-32, or what is wrong with them."""
     try:
         packet = cobs.decode(frame)
     except cobs.DecodeError:
         return Fault.FRAMING
-    content = checked(packet)
-    if content is None:
-        return Fault.CHECKSUM
+    content, check = packet[: -_CRC.size], packet[-_CRC.size :]
+    intact = len(packet) >= _HEADER.size + _CRC.size and _CRC.unpack(check)[0] == crc32(content)
+    return content if intact else Fault.CHECKSUM
+
+
+def _finished(frame: bytes) -> Event:
+    content = content_of(frame)
+    if isinstance(content, Fault):
+        return content
     try:
         return decode(content)
-    except MalformedPacketError:
+    except (struct.error, ValueError):
         return Fault.MALFORMED

@@ -133,6 +133,7 @@ def report(session: Session) -> str:
         session,
         parts=parts,
         missing=missing,
+        figures=_figures,
         calibration=session.about["device"]["about"].get("calibration_file"),
         peep=protocol.PEEP,
         inspiration=protocol.INSPIRATION_STEPS * protocol.DT,
@@ -142,15 +143,12 @@ def report(session: Session) -> str:
 
 
 def _part(entry: str, condition: str, settings: Sequence[Setting]) -> dict[str, Any]:
-    rows, statements = [], []
-    for x in settings:
-        about = {"lung": x.lung, "pip": f"{x.pip:g}", "breaths": min(map(len, x.errors))}
-        rows.append({**about, "ends": [_figures(errors) for errors in x.errors]})
+    statements = []
     for k in range(2):
         ended = [x for x in settings if len(x.errors[k])]
         aims = [_phases(x.pip)[k][1] for x in ended]
         statements.append(stated([x.errors[k] for x in ended], aims))
-    return {"entry": entry, "condition": condition, "rows": rows, "statements": statements}
+    return {"entry": entry, "condition": condition, "settings": settings, "statements": statements}
 
 
 def _figures(errors: Floats) -> list[str]:

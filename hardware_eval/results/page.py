@@ -52,7 +52,8 @@ def page(session: Session) -> str:
     plan, about = session.plan, session.about
     left = len(session.left)
     try:
-        analysed, missing = trial.analyse([session.path]), ()
+        analysed = trial.analyse([session.path])
+        missing = analysed.missing
     except InputError as error:
         analysed, missing = None, (str(error),)
     return rendered(
@@ -60,12 +61,9 @@ def page(session: Session) -> str:
         session,
         notes=plain(about["notes"]),
         done=len(plan.runs) - left,
-        table=[] if analysed is None else _table(session, analysed),
-        agreement={
-            name.capitalize(): shown(value)
-            for name, value in ({} if analysed is None else analysed.agreement).items()
-        },
-        missing=missing if analysed is None else analysed.missing,
+        trial=analysed,
+        shown=shown,
+        missing=missing,
         entries=[_entry(session, name) for name in plan.entries],
         timing=[_timing(session, name) for name in plan.entries],
         stopped=_stopped(session),
@@ -78,33 +76,14 @@ def page(session: Session) -> str:
     )
 
 
-def shown(value: Interval, sign: bool = False) -> str:
-    """A figure with its interval; a dash for none."""
+def shown(value: Interval | float, sign: bool = False) -> str:
+    """A figure with its interval, if it has one; a dash for none."""
+    if not isinstance(value, Interval):
+        value = Interval(value)
     if math.isnan(value.value):
         return "–"
     own, low, high = (number(x, 3, sign) for x in (value.value, value.low, value.high))
     return own if math.isnan(value.low) else f"{own} ({low} to {high})"
-
-
-def _table(session: Session, analysed: trial.Trial) -> list[dict[str, Any]]:
-    """A row for each entry, and under it one for each lung."""
-
-    def row(name: str, error: Interval, simulated: float, gap: Interval, done: str) -> Any:
-        cells = {"error": shown(error), "simulated": shown(Interval(simulated))}
-        ends = {"done": done, "whole": False, "repeats": ""}
-        return {"name": name, **cells, "gap": shown(gap, sign=True), **ends}
-
-    rows = []
-    for name, entry in analysed.entries.items():
-        done, of = (sum(part) for part in zip(*entry.successes.values(), strict=True))
-        mean = float(np.mean(list(entry.simulated.values())))
-        whole = row(name, entry.score, mean, entry.gap, f"{done} of {of}")
-        rows.append({**whole, "whole": True, "repeats": shown(Interval(entry.repeat_sd))})
-        for lung in session.lungs:
-            score, gap = entry.scores[lung], entry.gaps[lung]
-            done, of = entry.successes[lung]
-            rows.append(row(lung, score, entry.simulated[lung], gap, f"{done} of {of}"))
-    return rows
 
 
 def _entry(session: Session, name: str) -> dict[str, Any]:
@@ -158,15 +137,13 @@ def _timing(session: Session, name: str) -> dict[str, Any]:
     }
 
 
-def _stopped(session: Session) -> list[dict[str, Any]]:
-    """Attempts that did not complete, alike ones together."""
-    runs = [
-        (x["entry"], x["lung"], f"{x['pip']:g}", x["status"], plain(x["reason"]))
+def _stopped(session: Session) -> Counter[tuple[str, str, float, str, str]]:
+    """Attempts that did not complete, alike ones together: entry, lung, PIP, status and reason."""
+    return Counter(
+        (x["entry"], x["lung"], x["pip"], x["status"], plain(x["reason"]))
         for x in session.of_type("run")
         if x["status"] != "complete"
-    ]
-    keys = ("entry", "lung", "pip", "status", "reason")
-    return [{**dict(zip(keys, run, strict=True)), "count": n} for run, n in Counter(runs).items()]
+    )
 
 
 def _skipped(session: Session, left: int) -> list[str]:

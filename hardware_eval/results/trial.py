@@ -108,6 +108,12 @@ class EntryTrial:
     repeat_sd: float  #: standard deviation of repeats, pooled, cmH2O.
     mounting_sd: float  #: standard deviation of the gap between mountings beyond that, cmH2O.
 
+    @property
+    def runs(self) -> tuple[int, int]:
+        """Completed scored runs, and all of them."""
+        completed, runs = zip(*self.successes.values(), strict=True)
+        return sum(completed), sum(runs)
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -121,7 +127,7 @@ class Trial:
     def __str__(self) -> str:
         rows = []
         for name, x in self.entries.items():
-            done, runs = (sum(part) for part in zip(*x.successes.values(), strict=True))
+            done, runs = x.runs
             rows.append(
                 f"{name}: error {x.score} cmH2O as mounted; {done} of {runs} runs succeeded "
                 f"({x.success.low:.1%} to {x.success.high:.1%})"

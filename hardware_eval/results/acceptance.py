@@ -134,10 +134,7 @@ def report(session: Session) -> str:
         parts=parts,
         missing=missing,
         figures=_figures,
-        calibration=session.about["device"]["about"].get("calibration_file"),
-        peep=protocol.PEEP,
-        inspiration=protocol.INSPIRATION_STEPS * protocol.DT,
-        breath=protocol.BREATH_STEPS * protocol.DT,
+        protocol=protocol,
         window=1000.0 * LAST * protocol.DT,
     )
 

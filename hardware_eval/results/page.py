@@ -29,18 +29,14 @@ PAGE, ACCEPTANCE = "session.html", "acceptance.html"
 
 
 def rendered(template: str, session: Session, **content: Any) -> str:
-    """A page by a template of this room, which knows the session, its device and its log too."""
-    pips, about = session.plan.pips, session.about
+    """A page by a template of this room, which knows the session too."""
     sheet = page_templates("ventbench.pages").get_template("report.css.j2")
     given = {"colors": palette.css(), "run_colors": palette.RUNS, "shades": (), "names": ()}
     page = page_templates("hardware_eval.results").get_template(template)
     return page.render(
-        style=sheet.render(**given, pips=pips),
-        plan=session.plan,
-        lungs=session.lungs,
-        device=about["device"],
-        operator=plain(about["operator"]),
-        log=session.path.name,
+        style=sheet.render(**given, pips=session.plan.pips),
+        session=session,
+        plain=plain,
         sha256=files.sha256(session.path),
         version=ventbench.__version__,
         **content,
@@ -49,8 +45,7 @@ def rendered(template: str, session: Session, **content: Any) -> str:
 
 def page(session: Session) -> str:
     """The page."""
-    plan, about = session.plan, session.about
-    left = len(session.left)
+    entries = session.plan.entries
     try:
         analysed = trial.analyse([session.path])
         missing = analysed.missing
@@ -59,20 +54,16 @@ def page(session: Session) -> str:
     return rendered(
         "session.html.j2",
         session,
-        notes=plain(about["notes"]),
-        done=len(plan.runs) - left,
         trial=analysed,
         shown=shown,
         missing=missing,
-        entries=[_entry(session, name) for name in plan.entries],
-        timing=[_timing(session, name) for name in plan.entries],
+        grids={name: _grid(session, name) for name in entries},
+        timing={name: _timing(session, name) for name in entries},
         stopped=_stopped(session),
         tests=[line for line in session.of_type("selftest") if "go" in line],
         control=record.control(session),
-        skipped=_skipped(session, left),
+        skipped=_skipped(session),
         shown_breath=panels.BREATH + 1,
-        priority=about.get("priority"),
-        sessions=len(session.of_type("session")),
     )
 
 
@@ -86,18 +77,17 @@ def shown(value: Interval | float, sign: bool = False) -> str:
     return own if math.isnan(value.low) else f"{own} ({low} to {high})"
 
 
-def _entry(session: Session, name: str) -> dict[str, Any]:
+def _grid(session: Session, name: str) -> dict[str, list[dict[str, Any]]]:
     """Panels of an entry: a row for each lung, a column for each PIP, with all repeats."""
     runs = [x for x in session.breaths if x.run.entry == name and x.run.kind == "scored"]
     shown = [x for x in runs if x.breath == panels.BREATH and x.complete]
-    grid = []
-    for lung in session.lungs:
-        row = [
+    return {
+        lung: [
             _panel(pip, [x for x in shown if (x.run.lung, x.run.pip) == (lung, pip)])
             for pip in session.plan.pips
         ]
-        grid.append({"lung": lung, "panels": row})
-    return {"name": name, "grid": grid}
+        for lung in session.lungs
+    }
 
 
 def _panel(pip: float, repeats: Sequence[LoggedBreath]) -> dict[str, Any]:
@@ -129,7 +119,6 @@ def _timing(session: Session, name: str) -> dict[str, Any]:
     except InputError:  # no breath yet
         figures = None
     return {
-        "name": name,
         "figures": figures,
         "late": sum(x["late"] for x in beside),
         "asked": sum(x["asked"] for x in beside),
@@ -146,10 +135,10 @@ def _stopped(session: Session) -> Counter[tuple[str, str, float, str, str]]:
     )
 
 
-def _skipped(session: Session, left: int) -> list[str]:
+def _skipped(session: Session) -> list[str]:
     """What was not done, a sentence each."""
     told = []
-    if left:
+    if left := len(session.left):
         told.append(f"{left} of {len(session.plan.runs)} runs are left; `run` continues the plan.")
     if not any(x.get("simulated") for x in session.of_type("session")):
         told.append("There was no dry run, so that nothing is known of the simulation.")

@@ -328,16 +328,10 @@ class Calibration:
 
     def save(self, path: Path) -> Calibration:
         """Write it; returns it with its hash."""
-        parts = {}
-        for kind, part in self.parts.items():
-            line = part.fit
-            found = {"intercept": vars(line.intercept), "slope": vars(line.slope)}
-            parts[kind] = {
-                **vars(part),
-                "units": PARTS[kind][:2],
-                **found,
-                "residual": line.residual,
-            }
+        parts = {
+            kind: {**vars(part), "units": PARTS[kind][:2], **msgspec.to_builtins(part.fit)}
+            for kind, part in self.parts.items()
+        }
         content = {"format": FORMAT, "device": self.device, "parts": parts}
         return replace(self, sha256=dated.save(path, content))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import re
 import select
@@ -18,8 +17,10 @@ import numpy as np
 
 from hardware_eval.bench.loop import BreathLog, EmergencyStop, Operator, Show
 from hardware_eval.bench.plan import Plan, PlannedRun
+from hardware_eval.bench.raw_log import LoggedBreath
 from hardware_eval.emulation.emulator import LoopbackDevice
 from ventbench.base.errors import InputError, require
+from ventbench.base.files import json_values
 from ventbench.task import protocol
 
 #: What the operator does by hand.
@@ -258,7 +259,7 @@ class RerunView:
 _SAMPLES = ("pressure", "flow", "target", "requested", "u_in", "u_out", "late")
 
 
-def write_mcap(path: Path, breaths: Iterable[tuple[PlannedRun, BreathLog]]) -> None:
+def write_mcap(path: Path, breaths: Iterable[LoggedBreath]) -> None:
     """Write breaths to an MCAP file, for Foxglove and its kin: JSON, one message a step.
 
     The topic ``/breath`` has the samples in the log's units, null where there is none, and what
@@ -278,11 +279,10 @@ def write_mcap(path: Path, breaths: Iterable[tuple[PlannedRun, BreathLog]]) -> N
     writer.start(library="ventbench")
     known = writer.register_schema("ventbench.breath", "jsonschema", schema)
     channel = writer.register_channel("/breath", "json", known)
-    for run, breath in breaths:
+    for run, breath in ((each.run, each.log) for each in breaths):
         columns = [getattr(breath, name) for name in _SAMPLES]
         for time, *row in zip(breath.time, *columns, strict=True):
-            numbers = [value if math.isfinite(value) else None for value in row]
-            values = {"run": _told(run), **dict(zip(_SAMPLES, numbers, strict=True))}
+            values = {"run": _told(run), **dict(zip(_SAMPLES, json_values(row), strict=True))}
             at = round(1e9 * (start + time - breath.time[0]))
             writer.add_message(channel, at, json.dumps(values).encode(), at)
         start += breath.time[-1] - breath.time[0] + protocol.DT

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from hardware_eval.bench.console import RerunView, write_mcap
 from hardware_eval.bench.loop import ON_TIME_S, BreathLog
 from hardware_eval.bench.plan import CONTROL, UNDISTURBED
 from hardware_eval.bench.raw_log import (
     LOG,
-    LoggedBreath,
     Session,
     log_of,
     read_session,
@@ -283,20 +283,14 @@ def replay(
     """
     session = read_session(log)
     runs, everything = len(session.plan.runs), session.breaths
-    _show(everything, rerun, mcap, runs)
-    problems = () if record is None else tuple(_differences(record, session))
-    return Replay(runs, runs - len(session.left), len(everything), timing(session), problems)
-
-
-def _show(everything: list[LoggedBreath], rerun: str | None, mcap: Path | None, total: int) -> None:
-    from hardware_eval.bench.console import RerunView, write_mcap
-
     if rerun:
         view = RerunView(rerun)
         for breath in everything:
-            view.breath(breath.run, breath.log, breath.run.number, total)
+            view.breath(breath.run, breath.log, breath.run.number, runs)
     if mcap:
-        write_mcap(mcap, [(breath.run, breath.log) for breath in everything])
+        write_mcap(mcap, everything)
+    problems = () if record is None else tuple(_differences(record, session))
+    return Replay(runs, runs - len(session.left), len(everything), timing(session), problems)
 
 
 def _differences(path: Path, session: Session) -> list[str]:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -317,13 +318,11 @@ def demo(
     planned = plan_controller(plain, PIPS)
     entry = planned.write(out / "entries", "first")
 
-    def evaluated(line: Line, entry: Path, name: str) -> dict[float, float]:
-        return errors_on(line, entry, lung, PIPS, out / name, sandbox=sandbox)
-
-    simulated = evaluated(emulated_line(plain, lung), entry, "simulated")
+    evaluated = partial(errors_on, lung=lung, pips=PIPS, sandbox=sandbox)
+    simulated = evaluated(emulated_line(plain, lung), entry, out=out / "simulated")
     step("A controller is planned on the simulator", f"{_mean(simulated):.2f} cmH2O there")
     line = emulated_line(hidden.plant, lung)
-    measured = evaluated(line, entry, "first")
+    measured = evaluated(line, entry, out=out / "first")
     against = _against(simulated, measured, "simulation")
     step("The same controller on the lung", f"{_said(measured)}{against}")
     bench = Bench(line.client, line.clock, DEFAULT, Operator(), rest=_HOW.rest)
@@ -347,7 +346,7 @@ def demo(
     replanned = plan_controller(diagnosis.plants.get(lung, plain), PIPS)
     second = replanned.write(out / "entries", "replanned")
     step("The controller is planned again on it", f"{replanned.error:.2f} cmH2O predicted")
-    retuned = evaluated(line, second, "second")
+    retuned = evaluated(line, second, out=out / "second")
     against = _against(measured, retuned, "the first")
     step("The replanned controller on the lung", f"{_said(retuned)}{against}")
     truth = _mechanism(effect.name, effect.parameters)

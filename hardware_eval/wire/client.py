@@ -159,8 +159,7 @@ class Link:
         """
         self.url = url
         self._patience = patience
-        self._port = self._open()
-        self._traffic = self._begun()
+        self._open()
 
     def write(self, data: bytes) -> None:
         """Send bytes; returns before they are sent. DisconnectedError if the port has gone."""
@@ -190,8 +189,7 @@ class Link:
         pause, end = min(_PAUSE, self._patience), time.monotonic() + self._patience
         while True:
             try:
-                self._port = self._open()
-                self._traffic = self._begun()
+                self._open()
                 return
             except LinkError as error:
                 if time.monotonic() + pause > end:
@@ -207,12 +205,8 @@ class Link:
             return False
         return isinstance(self._port, serial.Serial)
 
-    def _begun(self) -> Port:
-        """What carries bytes on the open port, until that goes away."""
-        lines = [self._port.fileno()]
-        return Port(lambda: lines.pop() if lines else None, lambda line: None, take_priority)
-
-    def _open(self) -> serial.Serial:
+    def _open(self) -> None:
+        """Open the port, and begin to carry bytes on it until it goes away."""
         try:
             if self.url.startswith("socket:") and urlsplit(self.url).port is None:
                 raise ValueError("it has no number")
@@ -228,7 +222,11 @@ class Link:
             raise LinkError(f"port {self.url!r}: {why}; {_PORTS}") from error
         except (OSError, serial.SerialException) as error:
             raise self._not_opened(error) from error
-        return cast(serial.Serial, port)  # others, such as sockets, have the same methods
+        self._port = cast(serial.Serial, port)  # others, such as sockets, have the same methods
+        lines = [port.fileno()]
+        self._traffic = Port(
+            lambda: lines.pop() if lines else None, lambda line: None, take_priority
+        )
 
     def _not_opened(self, error: OSError) -> LinkError:
         number = error.errno or getattr(error.__cause__ or error.__context__, "errno", None)

@@ -516,7 +516,7 @@ class Client:
         begun, self.vented = self._clock.now(), False
         self.transport.write(frame)
         answered = self._wait(begun + timeout)
-        name = message.kind.name.lower()
+        name = type(message).__name__.lower()
         if answered is None:
             raise NoAnswerError(
                 f"the device did not answer {name} within {1000 * timeout:.0f} ms: is it on, and "

@@ -16,7 +16,7 @@ from binascii import crc32
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import Enum, IntEnum, IntFlag
-from typing import Any, ClassVar
+from typing import Any
 
 from cobs import cobs
 
@@ -127,7 +127,6 @@ class Capability(IntFlag):
 class Hello:
     """Open a session; the device vents and answers with :class:`Welcome`."""
 
-    kind: ClassVar[Kind] = Kind.HELLO
     version: int = PROTOCOL_VERSION  #: protocol version of the host.
     #: pressure at which the device shall vent, cmH2O, if that is below its own limit; None for the
     #: device's own.
@@ -138,14 +137,11 @@ class Hello:
 class Arm:
     """Clear the causes of venting and begin a run; the watchdog starts at once."""
 
-    kind: ClassVar[Kind] = Kind.ARM
-
 
 @dataclass(frozen=True, slots=True)
 class Command:
     """Set the valves."""
 
-    kind: ClassVar[Kind] = Kind.COMMAND
     u_in: float  #: inspiratory valve, %, 0..100.
     u_out: int  #: expiratory valve, 0 closed, 1 open.
     #: device time of the newest reading that the host had, ms, modulo 2**32. The device refuses the
@@ -157,28 +153,21 @@ class Command:
 class Heartbeat:
     """Ask for a reading; moves no valve and does not feed the watchdog."""
 
-    kind: ClassVar[Kind] = Kind.HEARTBEAT
-
 
 @dataclass(frozen=True, slots=True)
 class Vent:
     """Vent now, until the host arms again."""
-
-    kind: ClassVar[Kind] = Kind.VENT
 
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
     """Ask for the device's error counters."""
 
-    kind: ClassVar[Kind] = Kind.STATISTICS
-
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
     """Identity and limits of a device."""
 
-    kind: ClassVar[Kind] = Kind.WELCOME
     version: int  #: protocol version of the device.
     firmware: tuple[int, int, int]  #: version of the device's program, (major, minor, patch).
     capabilities: Capability  #: what the device is and has.
@@ -198,7 +187,6 @@ class Welcome:
 class Reading:
     """State of the device; the answer to arm, command, heartbeat and vent."""
 
-    kind: ClassVar[Kind] = Kind.READING
     time: float  #: time of the sample on the device's clock, s.
     pressure: float  #: airway pressure, cmH2O; NaN if the sensor gives none.
     flow: float  #: flow into the lung, mL/s; NaN if the device does not measure it.
@@ -212,7 +200,6 @@ class Reading:
 class Refusal:
     """The device did not do what a message asks."""
 
-    kind: ClassVar[Kind] = Kind.REFUSAL
     reason: Reason  #: why.
     mode: Mode  #: what the device does with the valves.
     flags: Flag  #: as in :class:`Reading`.
@@ -222,7 +209,6 @@ class Refusal:
 class Counters:
     """Counts of the device since it started, each modulo 2**32."""
 
-    kind: ClassVar[Kind] = Kind.COUNTERS
     frames: int = 0  #: intact packets.
     commands: int = 0  #: commands that moved the valves.
     framing: int = 0  #: runs of bytes that are no frame: bad COBS, too long.
@@ -339,7 +325,20 @@ _LAYOUTS: dict[type[Message], tuple[_Coded, ...]] = {
     Refusal: (("B", int, Reason), _MODE, _FLAGS),
     Counters: (_U32,) * len(fields(Counters)),
 }
-_KINDS = {message.kind: message for message in _LAYOUTS}
+
+_KINDS: dict[Kind, type[Message]] = {
+    Kind.HELLO: Hello,
+    Kind.ARM: Arm,
+    Kind.COMMAND: Command,
+    Kind.HEARTBEAT: Heartbeat,
+    Kind.VENT: Vent,
+    Kind.STATISTICS: Statistics,
+    Kind.WELCOME: Welcome,
+    Kind.READING: Reading,
+    Kind.REFUSAL: Refusal,
+    Kind.COUNTERS: Counters,
+}
+_KIND_OF = {message: kind for kind, message in _KINDS.items()}
 
 
 def encode(packet: Packet) -> bytes:
@@ -361,9 +360,8 @@ def to_frame(packet: bytes) -> bytes:
 
 def to_packet(packet: Packet) -> bytes:
     """Return header, body and CRC-32 of a packet; see :func:`encode`."""
-    return with_crc(
-        _HEADER.pack(packet.message.kind, packet.session, packet.sequence) + _body(packet.message)
-    )
+    kind = _KIND_OF[type(packet.message)]
+    return with_crc(_HEADER.pack(kind, packet.session, packet.sequence) + _body(packet.message))
 
 
 def with_crc(content: bytes) -> bytes:

@@ -112,14 +112,14 @@ class Probe:
         self.in_time()
         if (got.session, got.sequence) != header:
             raise DiffersError(
-                f"{message.kind.name.lower()} {header[1]} of session {header[0]:#x} was answered "
+                f"{told(message)} {header[1]} of session {header[0]:#x} was answered "
                 f"with number {got.sequence} of session {got.session:#x}"
             )
         self.sequence += step if session is None and 0 < step <= WINDOW else 0
         if not isinstance(got.message, answer):
             raise DiffersError(
-                f"{message.kind.name.lower()} was answered with {told(got.message)}, not with "
-                f"{answer.kind.name.lower()}"
+                f"{told(message)} was answered with {told(got.message)}, not with "
+                f"{answer.__name__.lower()}"
             )
         if isinstance(got.message, Reading | Refusal) and got.message.mode is not Mode.RUNNING:
             self.fed = math.inf
@@ -132,7 +132,7 @@ class Probe:
     ) -> Refusal:
         """Send what must be refused for a reason."""
         got = self.ask(message, Refusal, step, session)
-        equal(f"{message.kind.name.lower()} refused for", got.reason.name, reason.name)
+        equal(f"{told(message)} refused for", got.reason.name, reason.name)
         return got
 
     def raw(self, data: bytes) -> Packet:

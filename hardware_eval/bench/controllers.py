@@ -14,7 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from scipy import stats
 
@@ -70,43 +70,6 @@ class Lateness:
 
 class ControllerFailedError(Exception):
     """A controller raised, returned no number, or did not answer for seconds."""
-
-
-class LiveController(Protocol):
-    """A controller that answers in time or not at all."""
-
-    @property
-    def longest_answer(self) -> float:
-        """Longest time that an answer took so far, s."""
-        ...
-
-    @property
-    def beside(self) -> Count:
-        """Answers of the empty controller beside it."""
-        ...
-
-    def act(self, row: Floats, budget: float) -> float | None:
-        """Ask for the next command.
-
-        Args:
-            row: the observation, as :func:`ventbench.entries.cells.pack` lays it out.
-            budget: time for the answer, s.
-
-        Returns:
-            ``u_in``, %; None if there is no answer yet.
-
-        Raises:
-            ControllerFailedError: if there will be none.
-        """
-        ...
-
-    def close(self) -> None:
-        """End it."""
-        ...
-
-
-#: Makes the controller of a run.
-MakeController = Callable[[PlannedRun], LiveController]
 
 
 #: A controller that computes nothing.
@@ -217,7 +180,18 @@ class SubmissionController(_Asked):
         return NONE if self._empty is None else self._empty.count - self._before
 
     def act(self, row: Floats, budget: float) -> float | None:
-        """Ask for the next command; an answer to an earlier observation is dropped."""
+        """Ask for the next command; an answer to an earlier observation is dropped.
+
+        Args:
+            row: the observation, as :func:`ventbench.entries.cells.pack` lays it out.
+            budget: time for the answer, s.
+
+        Returns:
+            ``u_in``, %; None if there is no answer yet.
+
+        Raises:
+            ControllerFailedError: if there will be none.
+        """
         began = time.perf_counter()
         if self._empty is not None:
             self._empty.ask(row, budget)
@@ -264,6 +238,13 @@ class PIController:
 
     def close(self) -> None:
         """Nothing to end."""
+
+
+#: A controller that answers in time or not at all.
+LiveController = SubmissionController | PIController
+
+#: Makes the controller of a run.
+MakeController = Callable[[PlannedRun], LiveController]
 
 
 def control_pid(run: PlannedRun) -> PIController:

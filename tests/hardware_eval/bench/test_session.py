@@ -34,24 +34,20 @@ def run(pip: float = 20.0, **about: Any) -> PlannedRun:
     return PlannedRun(0, about.pop("kind", "scored"), "pid", LUNG, pip, 1, **about)
 
 
-class Scripted:
+class Scripted(PIController):
     """A PID whose answers are changed at some steps of the run."""
 
     longest_answer, beside = 0.045, Count()
 
     def __init__(self, change: Callable[[int, float], float | None] = lambda step, u: u) -> None:
-        self._pid, self._change, self._step = PIController(GAINS), change, -1
+        super().__init__(GAINS)
+        self._change, self._step = change, -1
         self.rows: list[np.ndarray] = []
 
     def act(self, row: np.ndarray, budget: float) -> float | None:
         self._step += 1
         self.rows.append(row[0])
-        wanted = self._pid.act(row, budget)
-        assert wanted is not None
-        return self._change(self._step, wanted)
-
-    def close(self) -> None:
-        pass
+        return self._change(self._step, super().act(row, budget))
 
 
 def vented(device: FaultyDevice) -> bool:

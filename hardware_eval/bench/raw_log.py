@@ -49,7 +49,7 @@ class RawLog:
 
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._file = open(path, "ab")  # noqa: SIM115 - it stays open as long as the log
+        self._file = open(path, "ab+")  # noqa: SIM115 - it stays open as long as the log
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -57,14 +57,11 @@ class RawLog:
             raise InputError(
                 f"{path} is being written by another session; end that first"
             ) from None
-        size = path.stat().st_size
-        if size == 0:
+        if not self._file.seek(0, os.SEEK_END):
             self.append({"type": "log", "format": FORMAT})
             return
-        with open(path, "rb") as file:
-            file.seek(-1, os.SEEK_END)
-            cut = file.read(1) != b"\n"
-        if cut:
+        self._file.seek(-1, os.SEEK_END)
+        if self._file.read(1) != b"\n":  # it was cut off
             self._file.write(b"\n")
             self.append(_CUT)
 

@@ -8,7 +8,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from hardware_eval.bench.controllers import (
     ControllerFailedError,
     EmptyController,
     LiveController,
+    MakeController,
     SubmissionController,
 )
 from hardware_eval.bench.fallback import DEFAULT as FALLBACK
@@ -215,7 +216,7 @@ def controllers(
     *,
     real_time: bool,
     empty: EmptyController | None = None,
-) -> Callable[[PlannedRun], LiveController]:
+) -> MakeController:
     """A function that makes the controller of a run, in a process of its own as in scoring.
 
     An ``empty`` one runs beside each, if there is one.
@@ -340,7 +341,9 @@ def evaluate(
         make = controllers(submissions, plan.track, runner, real_time=line.real, empty=empty)
         log = stack.enter_context(RawLog(log_path))
         stack.enter_context(_ends_by_exception())
-        stack.enter_context(_quick_switches())
+        # The loop's thread waits at most half a millisecond for another.
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(0.0005)
         reason = session.run_plan(bench, plan, make, log, about=about, before_lung=tested)
     written: Path | None = None
     with contextlib.suppress(InputError):  # no whole breath yet
@@ -370,23 +373,8 @@ def _ends_by_exception() -> Iterator[None]:
     def interrupt(number: int, frame: object) -> None:
         raise KeyboardInterrupt(signal.Signals(number).name)
 
-    before = {}
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        with contextlib.suppress(ValueError):  # not in the main thread: the caller's business
-            before[number] = signal.signal(number, interrupt)
-    try:
+    with contextlib.ExitStack() as stack:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            with contextlib.suppress(ValueError):  # not in the main thread: the caller's business
+                stack.callback(signal.signal, number, signal.signal(number, interrupt))
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _quick_switches() -> Iterator[None]:
-    """Let the loop's thread wait at most half a millisecond for another."""
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(0.0005)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(interval)

@@ -26,7 +26,6 @@ from hardware_eval.wire.messages import (
     Flag,
     Heartbeat,
     Hello,
-    Kind,
     Mode,
     Packet,
     Reading,
@@ -120,21 +119,17 @@ def _faulty(host: Probe) -> None:
 
 
 def _malformed(host: Probe) -> None:
-    bodies = {
-        Kind.HELLO: 3,
-        Kind.ARM: 0,
-        Kind.COMMAND: 7,
-        Kind.HEARTBEAT: 0,
-        Kind.VENT: 0,
-        Kind.STATISTICS: 0,
-    }
+    # Hello, arm, command, heartbeat, vent and statistics, and how long their bodies are.
+    lengths = {0x01: 3, 0x02: 0, 0x03: 7, 0x04: 0, 0x05: 0, 0x06: 0}
+    wrong = [
+        (kind, size)
+        for kind, length in lengths.items()
+        for size in {length + 1, max(length - 1, 1)} - {length}
+    ]
+    wrong += [(kind, LONGEST_PACKET - 4 - 9) for kind in (0x00, 0x07, 0x7F, 0x80, 0xFF)]
     header = host.session.to_bytes(4, "little") + (host.sequence + 9).to_bytes(4, "little")
-    for kind, length in bodies.items():
-        for wrong in {length + 1, max(length - 1, 1)} - {length}:
-            _counted(host, to_frame(with_crc(bytes([kind]) + header + bytes(wrong))), malformed=1)
-    longest = bytes(LONGEST_PACKET - 4 - 9)
-    for kind in (0x00, 0x07, 0x7F, 0x80, 0xFF):
-        _counted(host, to_frame(with_crc(bytes([kind]) + header + longest)), malformed=1)
+    for kind, size in wrong:
+        _counted(host, to_frame(with_crc(bytes([kind]) + header + bytes(size))), malformed=1)
     echo = Reading(1.0, 5.0, math.nan, 0.0, 1, Mode.READY, Flag.NONE)
     _counted(host, host.frame(echo), malformed=1)
 

@@ -36,21 +36,6 @@ _OWN_LIMIT = 0xFFFF  # a host that asks for no lower pressure limit
 _NAME_BYTES = 32
 
 
-class Kind(IntEnum):
-    """Kinds of packets; the device's have the highest bit set."""
-
-    HELLO = 0x01
-    ARM = 0x02
-    COMMAND = 0x03
-    HEARTBEAT = 0x04
-    VENT = 0x05
-    STATISTICS = 0x06
-    WELCOME = 0x81
-    READING = 0x82
-    REFUSAL = 0x83
-    COUNTERS = 0x84
-
-
 class Mode(IntEnum):
     """What the device does with the valves."""
 
@@ -326,19 +311,20 @@ _LAYOUTS: dict[type[Message], tuple[_Coded, ...]] = {
     Counters: (_U32,) * len(fields(Counters)),
 }
 
-_KINDS: dict[Kind, type[Message]] = {
-    Kind.HELLO: Hello,
-    Kind.ARM: Arm,
-    Kind.COMMAND: Command,
-    Kind.HEARTBEAT: Heartbeat,
-    Kind.VENT: Vent,
-    Kind.STATISTICS: Statistics,
-    Kind.WELCOME: Welcome,
-    Kind.READING: Reading,
-    Kind.REFUSAL: Refusal,
-    Kind.COUNTERS: Counters,
+#: Messages by the kind of their packet; the device's have the highest bit set.
+KINDS: dict[int, type[Message]] = {
+    0x01: Hello,
+    0x02: Arm,
+    0x03: Command,
+    0x04: Heartbeat,
+    0x05: Vent,
+    0x06: Statistics,
+    0x81: Welcome,
+    0x82: Reading,
+    0x83: Refusal,
+    0x84: Counters,
 }
-_KIND_OF = {message: kind for kind, message in _KINDS.items()}
+_KIND_OF = {message: kind for kind, message in KINDS.items()}
 
 
 def encode(packet: Packet) -> bytes:
@@ -373,11 +359,12 @@ def decode(content: bytes) -> Packet:
     """Decode header and body of an intact packet.
 
     Raises:
-        ValueError: if the kind is unknown, or a value not of its type.
+        KeyError: if the kind is unknown.
+        ValueError: if a value is not of its type.
         struct.error: if the length is wrong.
     """
     number, session, sequence = _HEADER.unpack_from(content)
-    return Packet(session, sequence, _message(Kind(number), content[_HEADER.size :]))
+    return Packet(session, sequence, _message(KINDS[number], content[_HEADER.size :]))
 
 
 def _struct(layout: tuple[_Coded, ...]) -> struct.Struct:
@@ -393,8 +380,7 @@ def _body(message: Message) -> bytes:
     return _struct(layout).pack(*numbers) + name
 
 
-def _message(kind: Kind, body: bytes) -> Message:
-    message = _KINDS[kind]
+def _message(message: type[Message], body: bytes) -> Message:
     layout = _LAYOUTS[message]
     packed = _struct(layout)
     numbers = packed.unpack_from(body)
@@ -461,5 +447,5 @@ def _finished(frame: bytes) -> Event:
         return content
     try:
         return decode(content)
-    except (struct.error, ValueError):
+    except (struct.error, KeyError, ValueError):
         return Fault.MALFORMED

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hardware_eval.wire import messages
 from hardware_eval.wire.messages import (
+    KINDS,
     LONGEST_FRAME,
     LONGEST_PACKET,
     Arm,
@@ -24,7 +25,6 @@ from hardware_eval.wire.messages import (
     Flag,
     Heartbeat,
     Hello,
-    Kind,
     Mode,
     Packet,
     Reading,
@@ -136,8 +136,8 @@ def test_the_bytes_of_a_devices_answers_are_those_of_the_specification() -> None
 
 def test_the_specification_names_every_number() -> None:
     text = (Path(messages.__file__).parents[1] / "PROTOCOL.md").read_text("utf-8")
-    for kind in Kind:
-        assert f"| 0x{kind.value:02x} | {kind.name.lower()} |" in text
+    for kind, message in KINDS.items():
+        assert f"| 0x{kind:02x} | {message.__name__.lower()} |" in text
     for reason in Reason:
         assert f"{reason.value} {reason.name.lower().replace('_', ' ')}" in text.replace(
             "protocol version", "version"

@@ -453,7 +453,7 @@ def breathe(
             wanted = np.clip(act(rows), 0.0, protocol.U_MAX)
             for i in np.flatnonzero(~ended) if guarded else ():
                 states[i], wanted[i] = fallback.step(
-                    fallback.DEFAULT, states[i], step, read[i], pips[i], wanted[i], previous[i]
+                    states[i], step, read[i], pips[i], wanted[i], previous[i]
                 )
         watched.hold(np.where(ended, 0.0, wanted), np.full(n, float(not inspired)))
     runs = zip(pressure, pips.tolist(), strict=True)

@@ -80,7 +80,8 @@ class FallbackSettings:
         return len(self.delays[0])
 
 
-DEFAULT = FallbackSettings()
+#: Those of every bench.
+BOUNDS = FallbackSettings()
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,6 @@ class FallbackState:
 
 
 def step(
-    settings: FallbackSettings,
     state: FallbackState,
     time_step: int,
     pressure: float,
@@ -126,7 +126,6 @@ def step(
     """Choose between the entry's command and the fallback's, at a step of an inspiration.
 
     Args:
-        settings: bounds.
         state: of a lung at rest, or of the step before.
         time_step: step of the breath, from 0.
         pressure: reading, cmH2O; NaN if there is none.
@@ -138,20 +137,20 @@ def step(
         The next state, and the command, %.
     """
     if time_step == 0:
-        state = _begun(settings, state, pressure, before)
+        state = _begun(state, pressure, before)
     state = replace(state, pressures=(*state.pressures, pressure))
     known = math.isfinite(pressure)
     error = pip - pressure if known else 0.0
     share = protocol.DT / (protocol.DT + 0.5)
     integral = state.integral + share * (error - state.integral) if known else state.integral
     # Nothing is safer than a valve that is closed.
-    outside = bool(answer) and answer > 0.0 and not is_inside(settings, state, pip, answer)
+    outside = bool(answer) and answer > 0.0 and not is_inside(state, pip, answer)
     good = 0 if answer is None or outside else state.good + 1
-    active = not good or (state.active and good <= settings.hand_back)
+    active = not good or (state.active and good <= BOUNDS.hand_back)
     if active or answer is None:
         P, I = CONTROL_GAINS[state.lung.id]  # noqa: E741 - the field's names
         wanted = min(max(P * error + I * integral, 0.0), protocol.U_MAX) if known else before
-        command = largest_inside(settings, state, pip, wanted)
+        command = largest_inside(state, pip, wanted)
     else:
         command = answer
     episode = state.episode + 1 if active else 0
@@ -168,16 +167,14 @@ def step(
     ), command
 
 
-def _begun(
-    settings: FallbackSettings, state: FallbackState, pressure: float, before: float
-) -> FallbackState:
+def _begun(state: FallbackState, pressure: float, before: float) -> FallbackState:
     """The state at the first step of an inspiration; ``before`` is the bias flow's command."""
-    residual, late = protocol.PEEP, settings.last
+    residual, late = protocol.PEEP, BOUNDS.last
     if seen := [x for x in state.pressures if math.isfinite(x)]:
-        R, C, gain = _most(settings, state.lung)
-        filled = seen[-1] + settings.noise + gain * protocol.DT / C * sum(state.commands[-late:])
+        R, C, gain = _most(state.lung)
+        filled = seen[-1] + BOUNDS.noise + gain * protocol.DT / C * sum(state.commands[-late:])
         emptied = (protocol.BREATH_STEPS - protocol.INSPIRATION_STEPS) * protocol.DT
-        slowest = 1e-3 * state.lung.C * settings.C * (R + settings.outlet)
+        slowest = 1e-3 * state.lung.C * BOUNDS.C * (R + BOUNDS.outlet)
         residual += max(filled - protocol.PEEP, 0.0) * math.exp(-emptied / slowest)
     if math.isfinite(pressure):
         residual = max(residual, pressure)
@@ -186,69 +183,66 @@ def _begun(
         commands=(before,) * late,
         pressures=(),
         integral=0.0,
-        residual=residual + settings.noise,
+        residual=residual + BOUNDS.noise,
     )
 
 
-def _most(settings: FallbackSettings, lung: Lung) -> tuple[float, float, float]:
+def _most(lung: Lung) -> tuple[float, float, float]:
     """Most of R, cmH2O/(L/s), least of C, mL/cmH2O, most of the gain, mL/s per %."""
-    R = lung.R * settings.R + settings.apparatus
-    return R, lung.C / settings.C, VALVE_GAIN * settings.gain
+    R = lung.R * BOUNDS.R + BOUNDS.apparatus
+    return R, lung.C / BOUNDS.C, VALVE_GAIN * BOUNDS.gain
 
 
-def reachable(settings: FallbackSettings, state: FallbackState, answer: float) -> Floats:
+def reachable(state: FallbackState, answer: float) -> Floats:
     """Highest pressures on each rig if the valve takes an answer for a step and is then closed.
 
     Args:
-        settings: bounds.
         state: with the reading of this step.
         answer: command, %.
 
     Returns:
         Bound of each next step until all flow has ended, cmH2O, shape ``(rigs, last + 1)``.
     """
-    R_most, C, gain_most = _most(settings, state.lung)
-    last = settings.last
+    R_most, C, gain_most = _most(state.lung)
+    last = BOUNDS.last
     newest = len(state.pressures) - 1  # this step
     sent = np.array([*state.commands, answer, *[0.0] * (last + 1)])
     # Command whose flow each reading shows, from the inspiration's first on, by delay.
     by_lag = [sent[last - lag : len(sent) - lag] for lag in range(1, last + 1)]
-    shown = np.array(settings.delays) @ np.stack(by_lag)
+    shown = np.array(BOUNDS.delays) @ np.stack(by_lag)
     ahead = newest + np.arange(1, last + 2)
-    R = np.array([state.lung.R / settings.R, R_most])[:, None, None, None]
-    gain = VALVE_GAIN * np.array([1.0 / settings.gain, settings.gain])
+    R = np.array([state.lung.R / BOUNDS.R, R_most])[:, None, None, None]
+    gain = VALVE_GAIN * np.array([1.0 / BOUNDS.gain, BOUNDS.gain])
     flows = 1e-3 * gain[:, None, None] * shown  # L/s
     drops = R * np.stack([flows, flows**2])[:, None]  # linear, parabolic: (2, R, gain, delay, k)
     stored = np.cumsum(shown, axis=1) * gain_most * protocol.DT / C
     risen = (drops + stored).reshape(-1, len(sent) - last)
     # Since the inspiration began, with what may be left of the breath before.
     least = state.residual + risen[:, ahead]
-    for k in range(max(last, newest + 1 - settings.readings), newest + 1):
+    for k in range(max(last, newest + 1 - BOUNDS.readings), newest + 1):
         if math.isfinite(state.pressures[k]):
-            bound = state.pressures[k] + settings.noise + risen[:, ahead] - risen[:, k : k + 1]
+            bound = state.pressures[k] + BOUNDS.noise + risen[:, ahead] - risen[:, k : k + 1]
             least = np.minimum(least, bound)
     return least
 
 
-def is_inside(settings: FallbackSettings, state: FallbackState, pip: float, answer: float) -> bool:
+def is_inside(state: FallbackState, pip: float, answer: float) -> bool:
     """Whether no rig within the bounds comes to harm by a command, if the valve closes after it."""
-    ahead = reachable(settings, state, answer)
+    ahead = reachable(state, answer)
     if ahead[:, -1].max() > safety_limit(pip):
         return False
-    if len(state.pressures) <= settings.last:  # no reading tells the resistor's drop yet
+    if len(state.pressures) <= BOUNDS.last:  # no reading tells the resistor's drop yet
         return True
     seen = np.broadcast_to(measured.worst(state.pressures), (len(ahead), len(state.pressures)))
     return bool(is_brief(np.concatenate([seen, ahead], axis=1), pip, protocol.DT).all())
 
 
-def largest_inside(
-    settings: FallbackSettings, state: FallbackState, pip: float, wanted: float
-) -> float:
+def largest_inside(state: FallbackState, pip: float, wanted: float) -> float:
     """The largest command up to ``wanted`` that is inside, %; 0 if none is."""
-    if is_inside(settings, state, pip, wanted):
+    if is_inside(state, pip, wanted):
         return wanted
     low, high = 0.0, wanted
     for _ in range(10):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if is_inside(settings, state, pip, middle) else (low, middle)
+        low, high = (middle, high) if is_inside(state, pip, middle) else (low, middle)
     return low

@@ -31,7 +31,6 @@ from hardware_eval.bench.controllers import (
     Lateness,
     LiveController,
 )
-from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.plan import MEASURED, PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
@@ -154,8 +153,7 @@ class Bench:
     operator: Operator  #: the person.
     shows: Sequence[Show] = ()  #: what shows breaths.
     rest: float = REST_S  #: time at rest before each run, s.
-    #: bounds of the controller that takes over; None for none.
-    fallback: FallbackSettings | None = None
+    fallback: bool = False  #: whether a safe controller takes over.
     lateness: Lateness = field(default_factory=Lateness)  #: late answers, to tell whose they are.
 
 
@@ -495,13 +493,13 @@ class _Loop(Watched):
         self._late_answers += math.isnan(requested) and budget >= _FAIR
         if not math.isnan(requested):
             u_in, cut = safety.limit_command(bench.settings, previous, requested)
-        elif bench.fallback is None:
+        elif not bench.fallback:
             u_in = self.last[0] if self.last[1] == 0 else 0.0
         else:
             u_in = None
-        if bench.fallback is not None:
+        if bench.fallback:
             self._fallback, u_in = fallback.step(
-                bench.fallback, self._fallback, step, pressure, run.pip, u_in, previous
+                self._fallback, step, pressure, run.pip, u_in, previous
             )
             u_in, also = safety.limit_command(bench.settings, previous, u_in)
             cut |= also

@@ -16,6 +16,7 @@ from hardware_eval.bench.controllers import (
     MakeController,
     control_pid,
 )
+from hardware_eval.bench.fallback import BOUNDS
 from hardware_eval.bench.loop import (
     Bench,
     BreathLog,
@@ -74,7 +75,7 @@ def run_plan(
     remaining, attempts = progress(plan, logged)
     if not any(line["type"] == "plan" for line in logged):
         log.append({"type": "plan", "plan": plan.as_dict()})
-    own = None if bench.fallback is None else asdict(bench.fallback)
+    own = asdict(BOUNDS) if bench.fallback else None
     log.append(
         {"type": "session", **about, "safety": {**bench.settings.as_dict(), "fallback": own}}
     )

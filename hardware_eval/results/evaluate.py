@@ -24,7 +24,6 @@ from hardware_eval.bench.controllers import (
     MakeController,
     SubmissionController,
 )
-from hardware_eval.bench.fallback import DEFAULT as FALLBACK
 from hardware_eval.bench.loop import Bench, Operator, Show
 from hardware_eval.bench.plan import UNDISTURBED, Plan, PlannedRun, Procedure
 from hardware_eval.bench.raw_log import LOG, RECORDING, RawLog, lines, write_recording
@@ -293,8 +292,7 @@ def evaluate(
         )
     left_out = chosen_parts(how.skip)
     settings = SafetySettings(largest_u_in=how.largest_u_in, largest_rise=how.largest_rise)
-    fallback = FALLBACK if how.fallback else None
-    bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, fallback)
+    bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, how.fallback)
     runner = make_runner(sandbox)
     log_path = out / LOG
     simulated: list[tuple[str, str, float, float]] = []

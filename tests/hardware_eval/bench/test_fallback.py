@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hardware_eval.bench import fallback
-from hardware_eval.bench.fallback import DEFAULT
+from hardware_eval.bench.fallback import BOUNDS
 from hardware_eval.bench.loop import Bench, run_once
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNGS, Lung
@@ -24,11 +24,11 @@ class Rig:
     """A lung within the bounds, integrated by scipy; slow valves mix the delays."""
 
     def __init__(self, label: Lung, draw: np.random.Generator) -> None:
-        low, high = label.R / DEFAULT.R, label.R * DEFAULT.R + DEFAULT.apparatus
+        low, high = label.R / BOUNDS.R, label.R * BOUNDS.R + BOUNDS.apparatus
         self.R = draw.choice([low, high, draw.uniform(low, high)])
-        self.C = label.C * draw.choice([1.0 / DEFAULT.C, draw.uniform(0.9, 1.15)])
-        self.gain = 22.8 * draw.choice([1.0 / DEFAULT.gain, DEFAULT.gain, draw.uniform(0.9, 1.1)])
-        delays, self.parabolic = np.array(DEFAULT.delays), draw.random() < 0.5
+        self.C = label.C * draw.choice([1.0 / BOUNDS.C, draw.uniform(0.9, 1.15)])
+        self.gain = 22.8 * draw.choice([1.0 / BOUNDS.gain, BOUNDS.gain, draw.uniform(0.9, 1.1)])
+        delays, self.parabolic = np.array(BOUNDS.delays), draw.random() < 0.5
         shares = np.eye(len(delays))[draw.integers(len(delays))]
         self.mix = (shares if self.parabolic else draw.dirichlet(np.ones(len(delays)))) @ delays
         self.sent, self.volume = [0.0, 0.0, 0.0], 0.0
@@ -58,13 +58,13 @@ def test_no_rig_within_the_bounds_exceeds_what_is_reachable(seed: int) -> None:
         pressure, pip = protocol.PEEP, float(draw.uniform(10.0, 35.0))
         for step in range(int(draw.integers(1, 12))):
             answer = float(draw.uniform(0.0, 40.0))
-            read = pressure + draw.uniform(-1.0, 1.0) * DEFAULT.noise
-            state, command = fallback.step(DEFAULT, state, step, read, pip, answer, 0.0)
+            read = pressure + draw.uniform(-1.0, 1.0) * BOUNDS.noise
+            state, command = fallback.step(state, step, read, pip, answer, 0.0)
             pressure = rig.hold(command)
-        read = pressure + draw.uniform(-1.0, 1.0) * DEFAULT.noise
+        read = pressure + draw.uniform(-1.0, 1.0) * BOUNDS.noise
         state = replace(state, pressures=(*state.pressures, read))
         last = float(draw.uniform(0.0, 100.0))
-        bound = fallback.reachable(DEFAULT, state, last).max(axis=0)
+        bound = fallback.reachable(state, last).max(axis=0)
         reached = [rig.hold(last), *[rig.hold(0.0) for _ in range(len(bound) - 1)]]
         assert np.all(np.array(reached) <= bound + 1e-6)
         nearest = min(nearest, float(np.min(bound - reached)))
@@ -79,18 +79,18 @@ def test_whatever_an_entry_asks_for_the_gate_holds(lung: Lung) -> None:
         pressure, above = protocol.PEEP, 0
         for step in range(protocol.INSPIRATION_STEPS):
             answer = None if draw.random() < 0.3 else float(draw.choice([0.0, 50.0, 100.0]))
-            state, command = fallback.step(DEFAULT, state, step, pressure, pip, answer, 0.0)
+            state, command = fallback.step(state, step, pressure, pip, answer, 0.0)
             pressure = rig.hold(command)
             limit = pip + protocol.SAFETY_MARGIN
             assert protocol.PEEP + 1e3 * rig.volume / rig.C <= limit
             # What the first commands did, unseen, has passed.
-            above += pressure > limit and step > 2 * DEFAULT.last
+            above += pressure > limit and step > 2 * BOUNDS.last
             assert above * DT <= protocol.SAFETY_TIME
         assert state.taken >= state.longest > 3
 
 
 def with_fallback(bench: Bench) -> Bench:
-    return Bench(bench.client, bench.clock, bench.settings, bench.operator, (), 2.0, DEFAULT)
+    return Bench(bench.client, bench.clock, bench.settings, bench.operator, (), 2.0, True)
 
 
 def test_it_takes_over_for_a_late_answer_and_hands_back(bench: Bench) -> None:
@@ -99,13 +99,13 @@ def test_it_takes_over_for_a_late_answer_and_hands_back(bench: Bench) -> None:
     )
     assert result.status == "complete", result.reason
     assert (result.late_answers, result.outside) == (1, 0)
-    assert result.fallback == result.longest_fallback == 1 + DEFAULT.hand_back
+    assert result.fallback == result.longest_fallback == 1 + BOUNDS.hand_back
     breath = result.breaths[0]
     asked = np.clip(breath.requested, 0.0, 100.0)
     by_entry = np.abs(np.array(breath.u_in) - asked) < 1e-9
     taken = [k for k in range(protocol.INSPIRATION_STEPS) if not by_entry[k]]
     assert taken[0] == 5
-    assert taken[-1] <= 5 + DEFAULT.hand_back
+    assert taken[-1] <= 5 + BOUNDS.hand_back
     assert breath.u_in[5] > 0.0
 
 

@@ -14,7 +14,6 @@ from msgspec import structs
 
 from hardware_eval.bench import session
 from hardware_eval.bench.controllers import ControllerFailedError, Count, PIController
-from hardware_eval.bench.fallback import FallbackSettings
 from hardware_eval.bench.loop import Bench, EmergencyStop, Operator, RunResult, run_once
 from hardware_eval.bench.plan import Plan, PlannedRun, make_plan
 from hardware_eval.bench.raw_log import RawLog, breaths, lines
@@ -339,7 +338,7 @@ def test_a_dry_run_finds_a_controller_that_is_unsafe(bench: Bench) -> None:
 
 def test_the_dry_run_has_the_fallback_of_the_run(bench: Bench) -> None:
     calm = make_plan(["pid"], [LUNG], pips=(10.0,), repeats=5, control_every=0)
-    guarded = replace(bench, fallback=FallbackSettings())
+    guarded = replace(bench, fallback=True)
     problems, _ = session.dry_run(guarded, calm, lambda run: Scripted(lambda step, u: 100.0))
     assert len(problems) == 1
     assert "were outside the envelope" in problems[0]

@@ -78,7 +78,11 @@ def _run(given: argparse.Namespace) -> int:
     try:
         if reason := realtime.prefer():
             print(f"no real-time scheduling: {reason}", file=sys.stderr)
-        _serve_until_signal(hal, sensor.pressure_limit, serial_line(given.port))
+        ended = realtime.told_to_end()
+        with contextlib.closing(Port(serial_line(given.port), os.close)) as port:
+            awake = notifier()
+            service = DeviceService(hal, time.monotonic(), sensor.pressure_limit)
+            Guard(service, port).run(lambda: ended() or hal.lost or awake())
     finally:
         hal.close()
         process.wait()
@@ -87,20 +91,6 @@ def _run(given: argparse.Namespace) -> int:
         PvpValves(given.config).close()  # the deadman could not
         print("the deadman has gone; vented", file=sys.stderr)
     return int(hal.lost)
-
-
-def _serve_until_signal(
-    hal: deadman.SupervisedHal, limit: float, open_line: Callable[[], int | None]
-) -> None:
-    ended = realtime.told_to_end()
-    port = Port(open_line, os.close)
-    awake = notifier()
-    try:
-        Guard(DeviceService(hal, time.monotonic(), limit), port).run(
-            lambda: ended() or hal.lost or awake()
-        )
-    finally:
-        port.close()
 
 
 def notifier() -> Callable[[], bool]:

@@ -92,6 +92,11 @@ class FlowSensor:
     largest: float  #: L/min.
     exponent: float  #: of the voltage.
 
+    def flow(self, counts: float) -> float:
+        """Flow of a conversion, mL/s."""
+        x = (counts * STEP - self.offset_voltage) / self.span_voltage
+        return math.copysign(abs(x) ** self.exponent, x) * self.largest * 1000.0 / 60.0
+
 
 @dataclass(frozen=True)
 class PvpConfiguration:
@@ -149,13 +154,6 @@ class Machine:
     def highest(self) -> float:
         """Largest pressure that sensor and converter can tell, cmH2O."""
         return min(self.part.range, self.pressure(LAST))
-
-    def flow_of(self, counts: float) -> float:
-        """Flow of a conversion, mL/s; NaN where nothing measures it."""
-        if self.flow is None:
-            return math.nan
-        x = (counts * STEP - self.flow.offset_voltage) / self.flow.span_voltage
-        return math.copysign(abs(x) ** self.flow.exponent, x) * self.flow.largest * 1000.0 / 60.0
 
 
 def load_machine(path: Path) -> Machine:
@@ -381,9 +379,9 @@ class PvpSensor:
         flow = math.nan
         try:
             counts = self._median()
-            if self._machine.flow is not None:
-                self._convert(self._machine.flow.adc_channel)
-                flow = self._machine.flow_of(self._median())
+            if (sensor := self._machine.flow) is not None:
+                self._convert(sensor.adc_channel)
+                flow = sensor.flow(self._median())
                 self._convert(self._wiring.adc_channel)
         except OSError:
             return Sample(now, math.nan)

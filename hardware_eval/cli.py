@@ -34,7 +34,8 @@ from hardware_eval.commands import (
 from ventbench.base import files
 from ventbench.base.text import number, plain
 from ventbench.cli import options
-from ventbench.cli.options import JsonFile
+from ventbench.cli.options import JsonFile, bar
+from ventbench.task.lungs import scored_lung
 
 #: What options are called now, by their former names.
 FORMER = {
@@ -237,7 +238,6 @@ def selftest(
     from hardware_eval.bench.selftest import chosen_parts
     from hardware_eval.bench.selftest import selftest as run_selftest
     from ventbench.plants.catalog import load_simulators
-    from ventbench.task.lungs import scored_lung
 
     label, simulators = scored_lung(lung).id, load_simulators(simulator)
     left_out = chosen_parts(skip or ())
@@ -355,8 +355,6 @@ def collect(
     from hardware_eval.bench.drive import collect as run_collection
     from hardware_eval.bench.raw_log import RECORDING
     from hardware_eval.results import evaluate as ev
-    from ventbench.cli.options import bar
-    from ventbench.task.lungs import scored_lung
 
     label = scored_lung(lung).id
     files.claim_folder(out)

@@ -14,6 +14,7 @@ import typer
 from ventbench.base import files
 from ventbench.base.errors import InputError
 from ventbench.cli.options import JsonFile, complete_lungs, emit
+from ventbench.task.lungs import scored_lung
 
 if TYPE_CHECKING:
     from hardware_eval.bench.calibrate import Calibration
@@ -170,7 +171,6 @@ def calibrate(
     """
     from hardware_eval.bench import calibrate as calibration
     from hardware_eval.bench.dated import device_of
-    from ventbench.task.lungs import scored_lung
 
     values = numbers("--reference", reference)
     label = scored_lung(lung).id

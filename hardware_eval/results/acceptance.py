@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -120,7 +119,8 @@ def report(session: Session) -> str:
     parts, missing = [], []
     for entry, (condition, tube) in product(session.plan.entries, CONDITIONS.items()):
         if settings := settings_of(session, entry, tube):
-            parts.append(_part(entry, condition, settings))
+            about = {"entry": entry, "condition": condition, "settings": settings}
+            parts.append({**about, "statements": _statements(settings)})
         else:
             lacks = f'{entry} has no run {condition}; `perturb = ["leak"]` in the plan makes them'
             missing.append(lacks)
@@ -139,13 +139,14 @@ def report(session: Session) -> str:
     )
 
 
-def _part(entry: str, condition: str, settings: Sequence[Setting]) -> dict[str, Any]:
+def _statements(settings: Sequence[Setting]) -> list[Statement]:
+    """What holds at the end of inspiration, and of expiration."""
     statements = []
     for k in range(2):
         ended = [x for x in settings if len(x.errors[k])]
         aims = [_phases(x.pip)[k][1] for x in ended]
         statements.append(stated([x.errors[k] for x in ended], aims))
-    return {"entry": entry, "condition": condition, "settings": settings, "statements": statements}
+    return statements
 
 
 def _figures(errors: Floats) -> list[str]:

@@ -134,10 +134,10 @@ def _await(port: str) -> None:
     if "://" in port or port.startswith("/dev/") or os.path.exists(port):
         return
     print(f"waiting for {port}: is an emulator starting? Ctrl-C ends this", file=sys.stderr)
-    looks = round(_COMPILES / _LOOK)
-    while looks and not os.path.exists(port):
+    for _ in range(round(_COMPILES / _LOOK)):
+        if os.path.exists(port):
+            return
         time.sleep(_LOOK)
-        looks -= 1
 
 
 def connect(port: str, confirmed: bool = True) -> Line:

@@ -143,14 +143,13 @@ class EmptyController(_Asked):
 
 
 class SubmissionController(_Asked):
-    """A submission, asked so that the loop need not wait for it.
+    """A submission; in real time it is asked so that the loop need not wait for it.
 
     Args:
         runner: as in scoring; see :class:`ventbench.entries.cells.Runner`.
         submission: whose code runs.
         task: what the controller is told.
-        real_time: whether ``budget`` holds; else answers are waited for.
-        empty: runs beside it; None for none.
+        empty: runs beside it in real time; without it answers are waited for, whatever the budget.
     """
 
     def __init__(
@@ -158,12 +157,10 @@ class SubmissionController(_Asked):
         runner: Any,
         submission: Any,
         task: Task,
-        *,
-        real_time: bool = True,
         empty: EmptyController | None = None,
     ) -> None:
-        super().__init__(runner, submission, task, real_time)
-        self._real_time, self._empty = real_time, empty
+        super().__init__(runner, submission, task, real_time=empty is not None)
+        self._empty = empty
         self._before = NONE if empty is None else empty.count
         self._label = submission.manifest.name
         self._check()
@@ -204,7 +201,7 @@ class SubmissionController(_Asked):
 
     def _result(self, pending: Future[Floats], budget: float) -> Floats | None:
         try:
-            answer = pending.result(max(budget, 0.0) if self._real_time else None)
+            answer = pending.result(None if self._empty is None else max(budget, 0.0))
         except NotYet:
             return None
         self._pending = None

@@ -212,8 +212,6 @@ def controllers(
     submissions: Sequence[Submission],
     track: str,
     runner: Any,
-    *,
-    real_time: bool,
     empty: EmptyController | None = None,
 ) -> MakeController:
     """A function that makes the controller of a run, in a process of its own as in scoring.
@@ -226,9 +224,7 @@ def controllers(
         lung = run.lung if track == "performance" else None
         task = Task(track, lung, protocol.DT, protocol.INSPIRATION_STEPS)
         try:
-            return SubmissionController(
-                runner, by_name[run.entry], task, real_time=real_time, empty=empty
-            )
+            return SubmissionController(runner, by_name[run.entry], task, empty)
         except SubmissionError as error:
             raise ControllerFailedError(str(error)) from error
 
@@ -298,7 +294,7 @@ def evaluate(
     simulated: list[tuple[str, str, float, float]] = []
     if how.dry_run and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
-        make = controllers(submissions, plan.track, runner, real_time=False)
+        make = controllers(submissions, plan.track, runner)
         problems, simulated = session.dry_run(bench, plan, make)
         if problems:
             raise InputError(
@@ -336,7 +332,7 @@ def evaluate(
                 about["priority"] = granted or realtime.has_priority()
             if not about["priority"]:
                 operator.tell(f"{realtime.DENIED}; a busy host is late more often")
-        make = controllers(submissions, plan.track, runner, real_time=line.real, empty=empty)
+        make = controllers(submissions, plan.track, runner, empty)
         log = stack.enter_context(RawLog(log_path))
         stack.enter_context(_ends_by_exception())
         # The loop's thread waits at most half a millisecond for another.

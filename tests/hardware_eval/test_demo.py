@@ -35,7 +35,7 @@ def test_a_written_entry_sends_its_plan_and_answers_what_is_missing(tmp_path: Pa
     submission = open_submission(str(planned.write(tmp_path, "planned")))
     assert submission.manifest.name == "planned"
     task = Task("performance", LUNG, 0.03, 34)
-    controller = SubmissionController(InProcessRunner(), submission, task, real_time=False)
+    controller = SubmissionController(InProcessRunner(), submission, task)
 
     def answer(step: int, pressure: float, pip: float) -> float | None:
         row = [step * 0.03 + 0.001 * (step > 0), 0.03, pressure, pip, *[pip] * 10, 5.0]

@@ -170,13 +170,12 @@ def calibrate(
     Example: `ventbench-hardware calibrate span --port /dev/ttyACM0 --reference 0,20,40,20,0`
     """
     from hardware_eval.bench import calibrate as calibration
-    from hardware_eval.bench.dated import device_of
 
     values = numbers("--reference", reference)
     label = scored_lung(lung).id
     files.claim_folder(out.parent)  # what a person reads off instruments must not be lost
     with bench_on(port, yes=yes) as (line, bench, _):
-        device = device_of(line.client)
+        device = line.client.identity.device
         kept = calibration.load(out, device, stale=True).parts if out.exists() else {}
         if part not in calibration.BASE and kept:
             line.client.calibrate(calibration.Calibration(device, kept).correction())
@@ -248,11 +247,10 @@ def calibration_of(line: Line, path: Path | None) -> Calibration:
         InputError: if it is stale, was changed, or is of another device than the line's.
     """
     from hardware_eval.bench import calibrate as calibration
-    from hardware_eval.bench.dated import device_of
 
     if path is None:
         return calibration.Calibration({}, {})
-    found = calibration.load(path, device_of(line.client))
+    found = calibration.load(path, line.client.identity.device)
     line.client.calibrate(found.correction())
     print(f"calibrated by {path}: {found.correction()}", file=sys.stderr)
     return found

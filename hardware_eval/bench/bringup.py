@@ -65,7 +65,7 @@ def keep(client: Client, operator: str, findings: Sequence[Finding]) -> dict[str
     """Write what a person found on a device; returns it, with the file and its hash."""
     content = {
         "format": FORMAT,
-        "device": dated.device_of(client),
+        "device": client.identity.device,
         "date": dated.today().isoformat(timespec="seconds"),
         "operator": operator,
         "version": VERSION,
@@ -89,7 +89,7 @@ def load(client: Client) -> dict[str, Any]:
     Raises:
         InputError: if there is none, or it is stale, was changed, or not confirmed.
     """
-    device = dated.device_of(client)
+    device = client.identity.device
     path = place(device)
     if not path.exists():
         raise InputError(
@@ -126,7 +126,7 @@ def bring_up(bench: Bench) -> list[Finding]:
             break
     client.hello()
     if is_confirmed(findings):
-        client.brought_up = dated.device_of(client)
+        client.brought_up = client.identity.device
     return findings
 
 
@@ -136,7 +136,7 @@ def look(bench: Bench, step: str) -> list[Finding]:
         return _room(bench)
     if step == "reference":
         return _reference(bench)
-    bench.client.brought_up = dated.device_of(bench.client)
+    bench.client.brought_up = bench.client.identity.device
     try:
         return _vent(bench) if step == "vent" else _clicked(bench, step)
     finally:

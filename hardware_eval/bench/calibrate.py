@@ -201,7 +201,7 @@ def measure(
 
 
 def _has_flow(bench: Bench) -> bool:
-    return Capability.FLOW in (bench.client.welcome or bench.client.hello()).capabilities
+    return Capability.FLOW in bench.client.identity.capabilities
 
 
 def _confirmed(bench: Bench, kind: str, question: str) -> None:
@@ -389,7 +389,7 @@ def load(path: Path, device: dict[str, str], *, stale: bool = False) -> Calibrat
 
     Args:
         path: of the file.
-        device: of :func:`hardware_eval.bench.dated.device_of`.
+        device: what the device says that it is, see :class:`Calibration`.
         stale: take stale parts too, to renew them one by one.
 
     Raises:

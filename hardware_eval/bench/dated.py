@@ -13,17 +13,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from hardware_eval.wire.client import Client
 from ventbench.base import files
 from ventbench.base.errors import InputError
 
 #: Age from which what was measured or confirmed must be so again, days.
 STALE = 30.0
-
-
-def device_of(client: Client) -> dict[str, str]:
-    """What a device says that it is: its number, and the hash of wiring and calibration."""
-    return (client.welcome or client.hello()).device
 
 
 def today() -> datetime.datetime:
@@ -45,7 +39,8 @@ def load(path: Path, form: str, device: Mapping[str, str], remedy: str) -> dict[
     Args:
         path: of the file.
         form: its format.
-        device: of :func:`device_of`.
+        device: what the device says that it is: its number, and the hash of wiring and
+            calibration.
         remedy: the command that makes such a file.
 
     Raises:

@@ -73,11 +73,6 @@ class Line:
     #: the bring-up of a real device, see :mod:`hardware_eval.bench.bringup`; empty for software.
     bringup: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def real(self) -> bool:
-        """Whether time is real, so that a controller can be late."""
-        return isinstance(self.clock, RealClock)
-
 
 #: Ports behind which there is software, whatever the device says of itself.
 EMULATED_PORTS = frozenset({"virtual", "pseudo-terminal", "own socket"})
@@ -169,7 +164,7 @@ def device_about(line: Line) -> dict[str, Any]:
     Software is told by the port that the host opened; a device may also say that it is simulated,
     but not that it is not.
     """
-    welcome = line.client.welcome or line.client.hello()
+    welcome = line.client.identity
     simulated = bool(welcome.capabilities & Capability.SIMULATED)
     return {
         "name": welcome.name,
@@ -325,7 +320,7 @@ def evaluate(
 
     with contextlib.ExitStack() as stack:
         empty = None
-        if line.real:
+        if isinstance(line.clock, RealClock):  # a controller can be late
             empty = EmptyController(make_runner(sandbox, SESSION_S))
             stack.callback(empty.close)
             with realtime.priority() as granted:

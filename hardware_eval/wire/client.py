@@ -400,10 +400,14 @@ class Client:
 
         The device compares what its sensor reads, so it is told the reading at its limit.
         """
-        welcome = self.welcome or self.hello()
-        limit = self._pressure_limit or welcome.pressure_limit
+        limit = self._pressure_limit or self.identity.pressure_limit
         self._correction = correction
         self.hello(limit)
+
+    @property
+    def identity(self) -> Welcome:
+        """What the device tells of itself; it is asked if it has not been yet."""
+        return self.welcome or self.hello()
 
     @property
     def simulated(self) -> bool:

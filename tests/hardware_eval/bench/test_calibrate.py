@@ -17,7 +17,6 @@ from scipy import stats
 
 from hardware_eval.bench import calibrate, dated
 from hardware_eval.bench.calibrate import Calibration, fit, load, measure
-from hardware_eval.bench.dated import device_of
 from hardware_eval.bench.identity import Baseline
 from hardware_eval.bench.loop import Bench, Operator
 from hardware_eval.bench.safety import DEFAULT
@@ -120,7 +119,7 @@ def test_the_emulated_bench_is_calibrated_and_the_file_is_kept_for_it(
     with pytest.raises(InputError, match="mL/s are lost: look for the leak"):
         measure(bench, "leak", lung=LUNG)
     hal.faults = ()
-    path, own = tmp_path / "calibration.json", device_of(bench.client)
+    path, own = tmp_path / "calibration.json", bench.client.identity.device
     saved = Calibration(own, parts).save(path)
     monkeypatch.setattr(dated, "today", lambda: DAY + datetime.timedelta(days=29))
     kept = load(path, own)
@@ -211,7 +210,7 @@ def test_readings_and_limits_are_corrected_by_what_was_calibrated(
     client = Client(device, device.clock)
     client.hello(40.0)
     bench = Bench(client, device.clock, DEFAULT, Shows(hal, lambda p: offset + slope * p))
-    own = device_of(client)
+    own = client.identity.device
     parts = {
         kind: measure(bench, kind, lung=LUNG, reference=references)
         for kind, references in (("span", (0.0, 20.0, 40.0)), ("zero", ()))

@@ -49,21 +49,10 @@ class Setting:
 
 @dataclass(frozen=True)
 class Statement:
-    """``± (bias + linearity * set pressure)``, and the line that it rests on."""
+    """``± (bias + linearity * set pressure)``."""
 
-    offset: float  #: of the line, cmH2O.
-    slope: float  #: of the line, cmH2O per cmH2O; 0 where one pressure was set.
-    rest: float  #: most that a breath departs from the line with 95 %, cmH2O.
-
-    @property
-    def bias(self) -> float:
-        """Largest bias error, cmH2O."""
-        return abs(self.offset) + self.rest
-
-    @property
-    def linearity(self) -> float:
-        """Largest linearity error, share of the set pressure."""
-        return abs(self.slope)
+    bias: float  #: largest bias error, cmH2O.
+    linearity: float  #: largest linearity error, share of the set pressure.
 
     def __str__(self) -> str:
         return f"± ({self.bias:.2f} cmH2O + {100.0 * self.linearity:.1f} % of the set pressure)"
@@ -78,7 +67,7 @@ def stated(errors: Sequence[Floats], pressures: Sequence[float]) -> Statement:
         slope, offset = (float(x) for x in np.polyfit(given, means, 1))
     scatter = np.array([each.std(ddof=1) if len(each) > 1 else 0.0 for each in errors])
     rest = np.abs(means - slope * given - offset) + 2.0 * scatter
-    return Statement(offset, slope, float(rest.max()))
+    return Statement(abs(offset) + float(rest.max()), abs(slope))
 
 
 def settings_of(session: Session, entry: str, tube: str) -> list[Setting]:

@@ -13,7 +13,7 @@ from hardware_eval.results.acceptance import stated
 def test_a_bias_and_a_slope_are_told_apart() -> None:
     pressures = [10.0, 20.0, 30.0]
     made = stated([np.full(5, 0.5 + 0.02 * pressure) for pressure in pressures], pressures)
-    assert (made.offset, made.slope, made.rest) == pytest.approx((0.5, 0.02, 0.0), abs=1e-9)
+    assert (made.bias, made.linearity) == pytest.approx((0.5, 0.02), abs=1e-9)
     assert str(made) == "± (0.50 cmH2O + 2.0 % of the set pressure)"
 
 

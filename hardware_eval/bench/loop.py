@@ -478,6 +478,7 @@ class _Loop(Watched):
             self.send(float(waveform.expiratory_command(step)), 1, math.nan)
             return
         requested, budget, cut = math.nan, 0.0, False
+        u_in: float | None = None
         previous = _BIAS if step == 0 else self.last[0]
         # A reading without a number would poison the averages of the entry that sees it.
         if math.isfinite(pressure := shown(reading)):
@@ -493,17 +494,14 @@ class _Loop(Watched):
         self._late_answers += math.isnan(requested) and budget >= _FAIR
         if not math.isnan(requested):
             u_in, cut = safety.limit_command(bench.settings, previous, requested)
-        elif not bench.fallback:
-            u_in = self.last[0] if self.last[1] == 0 else 0.0
-        else:
-            u_in = None
         if bench.fallback:
             self._fallback, u_in = fallback.step(
                 self._fallback, step, pressure, run.pip, u_in, previous
             )
             u_in, also = safety.limit_command(bench.settings, previous, u_in)
             cut |= also
-        assert u_in is not None
+        elif u_in is None:
+            u_in = self.last[0] if self.last[1] == 0 else 0.0
         self._limited += cut
         self.send(u_in, 0, requested)
 

@@ -60,6 +60,7 @@ class Firmware:
         hal: sensors and valves.
         state: last order.
         lost: whether it has ended.
+        image: process that runs the image; None before it starts.
     """
 
     def __init__(self, command: Sequence[str], hal: Hal, begun: float) -> None:
@@ -74,7 +75,7 @@ class Firmware:
         self.hal, self._begun = hal, begun
         self.state, self.lost = Order(), False
         self._answers: deque[bytes] = deque()
-        self._image: subprocess.Popen[bytes] | None = None
+        self.image: subprocess.Popen[bytes] | None = None
         self._ended = threading.Event()
         self._threads: list[threading.Thread] = []
         self._uart, self._bus = socket.socketpair(), socket.socketpair()
@@ -96,7 +97,7 @@ class Firmware:
             wake: called when the image has answered its host.
         """
         host, bus = self._uart[1].fileno(), self._bus[1].fileno()
-        self._image = subprocess.Popen(
+        self.image = subprocess.Popen(
             [part.format(host=host, bus=bus) for part in self._command],
             stdin=host,
             stdout=host,
@@ -109,12 +110,6 @@ class Firmware:
         for work in (lambda: self._listen(wake), self._order):
             self._threads.append(threading.Thread(target=work, daemon=True))
             self._threads[-1].start()
-
-    @property
-    def process(self) -> int:
-        """Process id of the image."""
-        assert self._image is not None
-        return self._image.pid
 
     def step(self, now: float, data: bytes = b"") -> bytes:
         """Send bytes to the image; returns what it has answered since."""
@@ -131,9 +126,9 @@ class Firmware:
     def close(self) -> None:
         """End the image."""
         self._ended.set()
-        if self._image is not None:
-            self._image.kill()  # SIGTERM makes QEMU complain
-            self._image.wait()
+        if self.image is not None:
+            self.image.kill()  # SIGTERM makes QEMU complain
+            self.image.wait()
         for thread in self._threads:
             thread.join()
         for line in (*self._uart, *self._bus):

@@ -180,7 +180,8 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
         each = np.stack(with_error(values), axis=1)
         return {name: interval(*x) for name, x in zip(mountings, each, strict=True)}
 
-    apart, error, _ = with_error(errors - simulated[..., None])
+    gaps = errors - simulated[..., None]
+    apart, error, _ = with_error(gaps)
     within = between = math.nan
     if repeats > 1:
         within = float(np.sqrt(errors.var(axis=-1, ddof=1).mean()))
@@ -193,7 +194,7 @@ def _entry(errors: Floats, simulated: Floats, mountings: Sequence[str]) -> Entry
         by_mounting(errors),
         dict(zip(mountings, simulated.mean(axis=1).tolist(), strict=True)),
         interval(*with_error(apart[None])),
-        by_mounting(errors - simulated[..., None]),
+        by_mounting(gaps),
         Interval(float(done.sum()) / errors.size, float(share.low), float(share.high)),
         {name: (int(n), pips * repeats) for name, n in zip(mountings, done, strict=True)},
         within,

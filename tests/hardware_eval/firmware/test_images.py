@@ -81,7 +81,8 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     firmware.start(lambda: emulator.port.inbox.put(b""))
     # Should it get into a loop, or outlive this test, it does not take the processor with it.
     longest = realtime.LONGEST_RUN_S * 1_000_000
-    device = firmware.process
+    assert firmware.image is not None
+    device = firmware.image.pid
     resource.prlimit(device, resource.RLIMIT_RTTIME, (longest, longest))
     for task in Path(f"/proc/{device}/task").iterdir():
         with contextlib.suppress(OSError):  # where it is granted
@@ -206,7 +207,8 @@ def test_electronics_vent_when_the_image_stands_still(device: tuple[Logged, Path
     client = Client(Link(str(folder / "lung")), timeout=2.0)
     _until(lambda: firmware.orders[-1].time > 0.0)
     _inspiring(firmware, client)
-    image = firmware.process
+    assert firmware.image is not None
+    image = firmware.image.pid
     os.kill(image, signal.SIGSTOP)
     log = folder / "electronics.csv"
     _until(lambda: log.read_text().splitlines()[-1].endswith("0,1,monostable"))

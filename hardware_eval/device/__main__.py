@@ -25,22 +25,18 @@ except InputError as missing:  # an extra that brings the wire
     raise SystemExit(2) from None
 
 
-def serial_line(path: str) -> Callable[[], int | None]:
-    """Return what opens a serial port; None while it is not there."""
+def open_serial(path: str) -> int | None:
+    """Open a serial port; returns its descriptor, or None while it is not there."""
+    import serial
 
-    def open_line() -> int | None:
-        import serial
-
-        try:
-            port = serial.Serial(path, BAUD_RATE, exclusive=True)
-        except serial.SerialException:
-            return None
-        descriptor = os.dup(port.fileno())
-        port.close()
-        os.set_blocking(descriptor, False)
-        return descriptor
-
-    return open_line
+    try:
+        port = serial.Serial(path, BAUD_RATE, exclusive=True)
+    except serial.SerialException:
+        return None
+    descriptor = os.dup(port.fileno())
+    port.close()
+    os.set_blocking(descriptor, False)
+    return descriptor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -79,7 +75,7 @@ def _run(given: argparse.Namespace) -> int:
         if reason := realtime.prefer():
             print(f"no real-time scheduling: {reason}", file=sys.stderr)
         ended = realtime.told_to_end()
-        with contextlib.closing(Port(serial_line(given.port), os.close)) as port:
+        with contextlib.closing(Port(lambda: open_serial(given.port), os.close)) as port:
             awake = notifier()
             service = DeviceService(hal, time.monotonic(), sensor.pressure_limit)
             Guard(service, port).run(lambda: ended() or hal.lost or awake())

@@ -402,9 +402,9 @@ def test_the_board_serves_one_host_after_another() -> None:
 
 
 def test_a_serial_line_that_is_not_there_is_waited_for(tmp_path: Path) -> None:
-    assert board.serial_line(str(tmp_path / "none"))() is None
+    assert board.open_serial(str(tmp_path / "none")) is None
     master, slave = os.openpty()
-    line = board.serial_line(os.ttyname(slave))()
+    line = board.open_serial(os.ttyname(slave))
     assert line is not None
     os.write(line, b"\0x\0")
     assert os.read(master, 10) == b"\0x\0"

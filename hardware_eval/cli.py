@@ -107,7 +107,7 @@ def run(
 
     Example: `ventbench-hardware run submissions/pid_best --port /dev/ttyACM0 --lung R20C50`
     """
-    from hardware_eval.bench.console import Blind, RerunView, show_bars
+    from hardware_eval.bench.console import Blind, show_bars, show_in_rerun
     from hardware_eval.bench.plan import make_plan, read_procedure
     from hardware_eval.results import evaluate as ev
 
@@ -126,7 +126,7 @@ def run(
         perturbations=how.perturb,
         seed=seed if how.seed is None else how.seed,
     )
-    shows = [show_bars, *([RerunView(how.rerun).breath] if how.rerun else [])]
+    shows = [show_bars, *([show_in_rerun(how.rerun)] if how.rerun else [])]
     calibration = None if how.calibration is None else Path(how.calibration)
 
     with bench_on(port, yes=yes, kept=out) as (line, _, person):

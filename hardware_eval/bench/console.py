@@ -215,8 +215,8 @@ def show_bars(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None
     )
 
 
-class RerunView:
-    """Sends breaths to a rerun viewer or file.
+def show_in_rerun(target: str) -> Show:
+    """Return what sends breaths to a rerun viewer or file, each after those before it.
 
     Args:
         target: ``"live"`` for a viewer that is started, else the path of an ``.rrd`` file.
@@ -224,35 +224,33 @@ class RerunView:
     Raises:
         InputError: if rerun is not installed, or the file cannot be written.
     """
+    require("rerun")
+    import rerun as rr
 
-    def __init__(self, target: str) -> None:
-        require("rerun")
-        import rerun as rr
+    stream = rr.RecordingStream("ventbench-hardware")
+    try:
+        if target == "live":
+            stream.spawn()
+        else:
+            stream.save(target)
+    except RuntimeError as error:  # whatever its core meets
+        raise InputError(f"--rerun {target}: {error}") from None
+    elapsed = 0.0
 
-        self._rr: Any = rr
-        self._stream = rr.RecordingStream("ventbench-hardware")
-        try:
-            if target == "live":
-                self._stream.spawn()
-            else:
-                self._stream.save(target)
-        except RuntimeError as error:  # whatever its core meets
-            raise InputError(f"--rerun {target}: {error}") from None
-        self._elapsed = 0.0
-
-    def breath(self, run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
-        """Log a breath, after those before it."""
-        rr = self._rr
-        start = self._elapsed - breath.time[0]
-        self._elapsed += breath.time[-1] - breath.time[0] + protocol.DT
+    def show(run: PlannedRun, breath: BreathLog, done: int, total: int) -> None:
+        nonlocal elapsed
+        start = elapsed - breath.time[0]
+        elapsed += breath.time[-1] - breath.time[0] + protocol.DT
         times = rr.TimeColumn("bench_time", duration=np.array(breath.time) + start)
         late = 1e3 * np.array(breath.late)
         shown = {"pressure": breath.pressure, "target": breath.target, "u_in": breath.u_in}
         for name, values in {**shown, "late_ms": late}.items():
             columns = rr.Scalars.columns(scalars=np.array(values, float))
-            self._stream.send_columns(f"/{name}", indexes=[times], columns=columns)
-        self._stream.set_time("bench_time", duration=float(breath.time[0] + start))
-        self._stream.log("/runs", rr.TextLog(_told(run)))
+            stream.send_columns(f"/{name}", indexes=[times], columns=columns)
+        stream.set_time("bench_time", duration=float(breath.time[0] + start))
+        stream.log("/runs", rr.TextLog(_told(run)))
+
+    return show
 
 
 #: Samples of a breath in an MCAP file.

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware_eval.bench.console import RerunView, write_mcap
+from hardware_eval.bench.console import show_in_rerun, write_mcap
 from hardware_eval.bench.loop import ON_TIME_S, BreathLog
 from hardware_eval.bench.plan import CONTROL, UNDISTURBED
 from hardware_eval.bench.raw_log import (
@@ -284,9 +284,9 @@ def replay(
     session = read_session(log)
     runs, everything = len(session.plan.runs), session.breaths
     if rerun:
-        view = RerunView(rerun)
+        show = show_in_rerun(rerun)
         for breath in everything:
-            view.breath(breath.run, breath.log, breath.run.number, runs)
+            show(breath.run, breath.log, breath.run.number, runs)
     if mcap:
         write_mcap(mcap, everything)
     problems = () if record is None else tuple(_differences(record, session))

@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import msgspec
 import typer
@@ -46,15 +46,21 @@ def told(json: Path | None) -> TextIO:
 def show(value: object, json: Path | None, *lines: object, ok: bool = True) -> None:
     """Write the result of a command to the file of ``--json``, and lines for people.
 
-    The result may hold dataclasses and paths; a number that is not finite becomes null.
+    The result may hold dataclasses, paths and what NumPy makes; a number that is not finite
+    becomes null.
 
     Raises:
         typer.Exit: with code 1 if the answer is no.
     """
-    emit(files.json_values(msgspec.to_builtins(value, enc_hook=str)), json)
+    emit(files.json_values(msgspec.to_builtins(value, enc_hook=_plain)), json)
     print(*lines, sep="\n", file=told(json))
     if not ok:
         raise typer.Exit(1)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has for a value of NumPy, or a path."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer.main
 from mcap.reader import make_reader
@@ -20,6 +21,7 @@ from hardware_eval import cli
 from hardware_eval.bench.controllers import ControllerFailedError, SubmissionController
 from hardware_eval.bench.plan import read_procedure
 from hardware_eval.bench.raw_log import breaths, lines
+from hardware_eval.commands import show
 from hardware_eval.device.program import Identity
 from hardware_eval.emulation.emulator import LoopbackDevice
 from hardware_eval.results import evaluate
@@ -207,6 +209,12 @@ def test_a_calibrated_part_is_written_as_json(on_line: Line, tmp_path: Path) -> 
     assert told["fit"]["intercept"]["value"] == pytest.approx(5.0, abs=0.1)
     assert told["fit"]["slope"]["value"] is None
     assert told["file"] == str(out)
+
+
+def test_numbers_of_numpy_and_paths_become_json(tmp_path: Path) -> None:
+    path = tmp_path / "shown.json"
+    show({"a": np.float64(1.5), "b": [np.nan, np.int64(2)], "c": path}, path, "shown")
+    assert json.loads(path.read_text()) == {"a": 1.5, "b": [None, 2], "c": str(path)}
 
 
 def test_the_manual_lists_every_key_of_a_plan(tmp_path: Path) -> None:

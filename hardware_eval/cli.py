@@ -410,7 +410,7 @@ def demo(
         tell=lambda text: print(text, file=to, flush=True),
     )
     said = f"{done.seconds:.0f} s; all figures: {out / 'demo.json'}"
-    show(done.as_dict(), json, said, ok=done.better)
+    show(done, json, said, ok=done.better)
 
 
 @app.command()

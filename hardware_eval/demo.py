@@ -236,20 +236,8 @@ class Demo:
     truth: dict[str, Any]  #: what was concealed.
     steps: tuple[str, ...]  #: what was done, with its figures, a sentence each.
     seconds: float  #: duration.
-
-    @property
-    def right(self) -> bool:
-        """Whether the concealed mechanism was named."""
-        return self.truth["name"] in self.named
-
-    @property
-    def better(self) -> bool:
-        """Whether the replanned entry does better on the lung than the first."""
-        return _mean(self.retuned) < _mean(self.measured)
-
-    def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
-        return files.json_values({**vars(self), "right": self.right, "better": self.better})
+    right: bool  #: whether the concealed mechanism was named.
+    better: bool  #: whether the replanned entry does better on the lung than the first.
 
 
 def _mechanism(name: str, parameters: Mapping[str, float]) -> str:
@@ -365,8 +353,10 @@ def demo(
         {"name": effect.name, "strength": effect.strength, "parameters": dict(effect.parameters)},
         tuple(steps),
         time.perf_counter() - began,
+        effect.name in named,
+        _mean(retuned) < _mean(measured),
     )
-    files.write_json(out / "demo.json", done.as_dict())
+    files.write_json(out / "demo.json", files.json_values(vars(done)))
     return done
 
 

@@ -408,9 +408,8 @@ class PvpSensor:
 
     def _conversion(self) -> int:
         """Counts of one conversion: the upper 12 bits of a signed 16-bit word."""
-        high, low = self._bus.read_i2c_block_data(self._wiring.adc_address, _CONVERSION, 2)
-        word = high << 8 | low
-        return (word - 0x10000 if word & 0x8000 else word) >> 4
+        word = self._bus.read_i2c_block_data(self._wiring.adc_address, _CONVERSION, 2)
+        return int.from_bytes(word, "big", signed=True) >> 4
 
 
 def _imported(name: str) -> Any:

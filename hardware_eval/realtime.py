@@ -56,10 +56,14 @@ class VirtualClock:
 Clock = RealClock | VirtualClock
 
 
+#: Signals that end a process.
+ENDING = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+
+
 def told_to_end() -> Callable[[], bool]:
     """Return what says whether a signal came that would end this process; it no longer does."""
     came: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in ENDING:
         signal.signal(number, lambda number, frame: came.append(number))
     return lambda: bool(came)
 

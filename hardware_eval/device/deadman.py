@@ -78,7 +78,7 @@ class Valves(Protocol):
 
 def supervise(orders: socket.socket, valves: Valves) -> None:
     """Obey orders until the other end is closed, whoever closes it; then vent."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in realtime.ENDING:
         signal.signal(number, signal.SIG_IGN)  # they are the program's, which then hangs up
     realtime.prefer(realtime.DEADMAN_PRIORITY)
     state = Deadman(time.monotonic())
@@ -153,7 +153,7 @@ class SupervisedHal:
     def sample(self, now: float) -> Sample:
         """The newest sample, and whether the deadman has vented since the last call."""
         lapsed = False
-        with contextlib.suppress(BlockingIOError, OSError):
+        with contextlib.suppress(OSError):
             lapsed = bool(self._orders.recv(64))
         return replace(self._latest, lapsed=True) if lapsed else self._latest
 

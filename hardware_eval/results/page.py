@@ -60,7 +60,6 @@ def page(session: Session) -> str:
         grids={name: _grid(session, name) for name in entries},
         timing={name: _timing(session, name) for name in entries},
         stopped=_stopped(session),
-        tests=[line for line in session.of_type("selftest") if "go" in line],
         control=record.control(session),
         skipped=_skipped(session),
         shown_breath=panels.BREATH + 1,

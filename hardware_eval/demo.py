@@ -66,13 +66,6 @@ from ventbench.task.interfaces import Plant, Signals
 #: PIPs of the demo, cmH2O: few, so that it takes minutes.
 PIPS = (10.0, 20.0, 30.0)
 
-#: Breaths that are collected for the comparison.
-BREATHS = 36
-
-#: Simulators of the demo. The concealed physics is all that the library's physics lacks; the
-#: frozen simulators differ from that physics by themselves, which hides what is concealed.
-SIMULATOR = "physics"
-
 #: How the entries run.
 _HOW = Procedure(fallback=False, dry_run=False, selftest=False, rest=2.0, notes="emulated lung")
 
@@ -269,10 +262,10 @@ def demo(
     words: str,
     out: Path,
     *,
-    breaths: int = BREATHS,
-    simulator: str = SIMULATOR,
-    sandbox: bool = True,
-    tell: Callable[[str], None] = lambda text: None,
+    breaths: int,
+    simulator: str,
+    sandbox: bool,
+    tell: Callable[[str], None],
 ) -> Demo:
     """Run the demo, in this process on a virtual clock.
 
@@ -280,7 +273,9 @@ def demo(
         words: any words; they determine lung and concealed physics.
         out: an empty folder for everything.
         breaths: breaths to collect for the diagnosis.
-        simulator: name of the simulators, which the concealed physics is added to.
+        simulator: name of the simulators, which the concealed physics is added to. It is all that
+            the library's physics lacks; the frozen simulators differ from that physics by
+            themselves, which hides what is concealed.
         sandbox: run entries as in scoring.
         tell: told every step and its figures as it ends.
 

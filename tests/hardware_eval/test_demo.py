@@ -77,7 +77,7 @@ def test_what_the_simulator_lacks_costs_and_a_plan_with_it_does_better(tmp_path:
 def test_the_loop_closes(tmp_path: Path) -> None:
     words = "monday"  # the words that the command has if none are given
     out = tmp_path / "demo"
-    done = demo(words, out, sandbox=False, tell=print)
+    done = demo(words, out, breaths=36, simulator="physics", sandbox=False, tell=print)
     hidden = conceal(words, "physics")
     effect = hidden.effect
     assert (hidden.lung.id, effect.name) == (done.lung, "leak")

@@ -195,18 +195,16 @@ def emulate(
     from ventbench.plants.catalog import load_simulators
 
     emulator.check_link(link)
-    runs_image = None if firmware is None else command_of(firmware)
+    command = None if firmware is None else command_of(firmware)
     lung_plant = load_simulators(simulator).plant(lung)
     print("compiling the lung; the terminal appears when it answers", file=sys.stderr, flush=True)
     hal = simulated.SimulatedHal(lung_plant, name=f"emulated {lung}", sensor=simulated.PVP_SENSOR)
     begun = time.monotonic()
-    image = None if runs_image is None else Firmware(runs_image, hal, begun)
-    try:
-        device = emulator.Emulator(
-            image or DeviceService(hal, 0.0),
-            link=link,
-            begun=begun,
-        )
+    running = contextlib.nullcontext()
+    if command is not None:
+        running = contextlib.closing(Firmware(command, hal, begun))
+    with running as image:
+        device = emulator.Emulator(image or DeviceService(hal, 0.0), link=link, begun=begun)
         prefer()
         ended = told_to_end()
         if image is not None:
@@ -215,9 +213,6 @@ def emulate(
         print(f"ready: {hal.identity.name}; Ctrl-C ends it", file=sys.stderr, flush=True)
         device.run(lambda: ended() or (image is not None and image.lost))
         print(f"longest lateness of the device: {1e3 * device.lateness:.1f} ms", file=sys.stderr)
-    finally:
-        if image is not None:
-            image.close()
     if image is not None and image.lost:
         raise typer.Exit(1)
 

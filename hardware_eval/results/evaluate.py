@@ -348,7 +348,8 @@ def evaluate(
         if stops := checked.header.stops:
             runs = checked.errors.size
             stopped[name] = f"{len(stops)} of {runs} runs failed, the first: {stops[0].reason}"
-            unrun |= {name} if len(stops) == runs else set()
+            if len(stops) == runs:
+                unrun.add(name)
     with contextlib.suppress(InputError):  # without jinja2, or a complete run
         page.write(out)
         acceptance.write(out)

@@ -131,6 +131,7 @@ class Hal(Sensor, Protocol):
 class DeviceState:
     """State between two steps."""
 
+    own_limit: float  #: pressure above which it vents, whatever a host asks, cmH2O.
     pressure_limit: float  #: limit of the session, cmH2O.
     valid: int  #: when the last valid sample was taken, us.
     changed: int  #: when the reading last changed, us.
@@ -151,11 +152,10 @@ class DeviceState:
 def init(own_limit: float, now: float) -> DeviceState:
     """Vented, no session, at ``now``, s; vents above a limit of its own, cmH2O."""
     begun = microseconds(now)
-    return DeviceState(own_limit, valid=begun, changed=begun, stepped=begun)
+    return DeviceState(own_limit, own_limit, valid=begun, changed=begun, stepped=begun)
 
 
 def step(
-    own_limit: float,
     identity: Identity,
     state: DeviceState,
     now: float,
@@ -168,7 +168,6 @@ def step(
     long the device itself was held up.
 
     Args:
-        own_limit: pressure above which the device vents, whatever a host asks, cmH2O.
         identity: what the device tells about itself.
         state: state from ``init`` or ``step``.
         now: time, s; never less than in the step before.
@@ -201,14 +200,13 @@ def step(
                 state = _counted(state, Fault.MALFORMED.value)
                 continue
             state, answer = _received(
-                own_limit, identity, _counted(state, "frames"), event, event.message, sample
+                identity, _counted(state, "frames"), event, event.message, sample
             )
             answers.append(encode(Packet(event.session, event.sequence, answer)))
     return state, b"".join(answers)
 
 
 def _received(
-    own_limit: float,
     identity: Identity,
     state: DeviceState,
     packet: Packet,
@@ -225,7 +223,7 @@ def _received(
         state = _vented(state, Flag.HOST_VENTED)
         answer = _reading(state, sample)
     elif isinstance(message, Hello):
-        state, answer = _opened(own_limit, identity, state, packet, message, fresh or not ours)
+        state, answer = _opened(identity, state, packet, message, fresh or not ours)
     elif not ours:
         state, answer = _counted(state, "session"), Reason.SESSION
     elif not fresh:
@@ -254,7 +252,6 @@ def _reading(state: DeviceState, sample: Sample) -> Reading:
 
 
 def _opened(
-    own_limit: float,
     identity: Identity,
     state: DeviceState,
     packet: Packet,
@@ -267,7 +264,7 @@ def _opened(
     if not acceptable:
         return _counted(state, "sequence"), Reason.SEQUENCE
     asked = hello.pressure_limit
-    limit = own_limit if asked is None else min(asked, own_limit)
+    limit = state.own_limit if asked is None else min(asked, state.own_limit)
     state = replace(
         _vented(state, Flag.NONE),
         mode=Mode.READY,
@@ -386,14 +383,12 @@ class DeviceService:
 
     Attributes:
         hal: the hardware.
-        own_limit: pressure above which it vents, cmH2O.
         state: state of the program.
     """
 
     def __init__(self, hal: Hal, now: float, own_limit: float = protocol.SAFETY_PRESSURE) -> None:
-        """Start vented, at ``now``, s."""
+        """Start vented, at ``now``, s; it vents above a limit of its own, cmH2O."""
         self.hal = hal
-        self.own_limit = own_limit
         self.state: DeviceState = init(own_limit, now)
         hal.actuate(now, self.state.u_in, self.state.u_out)
 
@@ -408,7 +403,7 @@ class DeviceService:
             Bytes to send.
         """
         sample = self.hal.sample(now)
-        self.state, answers = step(self.own_limit, self.hal.identity, self.state, now, data, sample)
+        self.state, answers = step(self.hal.identity, self.state, now, data, sample)
         self.hal.actuate(now, self.state.u_in, self.state.u_out)
         return answers
 

@@ -99,7 +99,7 @@ def _obeys(steps: list[tuple[int, int, tuple[str, int]]]) -> None:
     now, sequence = 0.0, 2
     sample = Sample(0.0, 5.0)
     opening = [Packet(SESSION, 1, Hello()), Packet(SESSION, 2, Arm())]
-    state, _ = program.step(SETTINGS, IDENTITY, state, now, b"".join(map(encode, opening)), sample)
+    state, _ = program.step(IDENTITY, state, now, b"".join(map(encode, opening)), sample)
     assert state.mode is Mode.RUNNING
     sent: list[tuple[float, int]] = []
     again: list[bytes] = []
@@ -115,7 +115,7 @@ def _obeys(steps: list[tuple[int, int, tuple[str, int]]]) -> None:
         data = _damaged(packet, damage, where)
         if where % 3 == 0 and again:
             data += again[where % len(again)]  # an old frame turns up after newer ones
-        state, answers = program.step(SETTINGS, IDENTITY, state, now, data, Sample(now, 5.0))
+        state, answers = program.step(IDENTITY, state, now, data, Sample(now, 5.0))
         # What comes intact is answered: the zero before a frame ends whatever came before.
         assert answers or damage not in ("none", "twice", "garbage")
         valves = (state.u_in, state.u_out)
@@ -130,6 +130,6 @@ def _obeys(steps: list[tuple[int, int, tuple[str, int]]]) -> None:
     for message in (Vent(), Arm(), Heartbeat(), Command(7.0, 0, milliseconds(now))):
         sequence += 1
         data = encode(Packet(SESSION, sequence, message))
-        state, answers = program.step(SETTINGS, IDENTITY, state, now, data, Sample(now, 5.0))
+        state, answers = program.step(IDENTITY, state, now, data, Sample(now, 5.0))
         assert answers
     assert (state.mode, state.u_in, state.u_out) == (Mode.RUNNING, 7.0, 0)

@@ -163,7 +163,7 @@ def test_both_devices_answer_alike(harness: Path, frames: int) -> None:
         steps, expected = [], []
         for _ in range(batch):
             now, sample, data = step = stimuli.next(state)
-            state, answers = program.step(SETTINGS, IDENTITY, state, now / 1e6, data, sample)
+            state, answers = program.step(IDENTITY, state, now / 1e6, data, sample)
             steps.append(step)
             expected.append(
                 (answers, state.mode, state.u_out, round(100 * state.u_in), state.causes)

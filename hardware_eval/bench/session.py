@@ -31,6 +31,12 @@ from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
 from hardware_eval.wire.client import Client, LinkError
 
+#: Tests a lung by its label; None where nobody does.
+LungTest = Callable[[str], Sheet | None]
+
+#: Entry, lung, PIP and error, cmH2O, of runs on simulators.
+Simulated = list[tuple[str, str, float, float]]
+
 #: Runs that the bench spoils in a row before the session gives up.
 MAX_ATTEMPTS = 3
 
@@ -52,7 +58,7 @@ def run_plan(
     log: RawLog,
     *,
     about: Mapping[str, Any],
-    before_lung: Callable[[str], Sheet | None] = lambda lung: None,
+    before_lung: LungTest = lambda lung: None,
 ) -> str:
     """Run what is left of a plan.
 
@@ -101,7 +107,7 @@ def _runs(
     attempts: dict[int, int],
     make_controller: MakeController,
     log: RawLog,
-    before_lung: Callable[[str], Sheet | None],
+    before_lung: LungTest,
 ) -> str:
     mounted, spoilt, held_up = "", 0, 0
     queue = list(remaining)
@@ -155,7 +161,7 @@ def _runs(
     return ""
 
 
-def _mount(bench: Bench, lung: str, log: RawLog, before_lung: Callable[[str], Sheet | None]) -> str:
+def _mount(bench: Bench, lung: str, log: RawLog, before_lung: LungTest) -> str:
     """Have a lung set and tested; returns why not to go on, or nothing."""
     if not bench.operator.confirm(f"set the lung to {lung} and connect it. Is it set?"):
         return f"the operator did not confirm lung {lung}"
@@ -229,7 +235,7 @@ def _ended(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[str,
 
 def dry_run(
     bench: Bench, plan: Plan, make_controller: MakeController
-) -> tuple[list[str], list[tuple[str, str, float, float]]]:
+) -> tuple[list[str], Simulated]:
     """Run every distinct run of a plan once on the frozen simulators, by the code of a bench.
 
     Repetitions are left out: on a simulator they are the same. Lungs start as on the bench, vented
@@ -248,7 +254,7 @@ def dry_run(
     from hardware_eval.emulation.simulated import simulated_lung
 
     problems: list[str] = []
-    errors: list[tuple[str, str, float, float]] = []
+    errors: Simulated = []
     for lung in plan.lungs:
         device = LoopbackDevice(simulated_lung(lung))
         client = Client(device, device.clock)

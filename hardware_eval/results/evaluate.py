@@ -286,7 +286,7 @@ def evaluate(
     bench = Bench(line.client, line.clock, settings, operator, shows, how.rest, how.fallback)
     runner = make_runner(sandbox)
     log_path = out / LOG
-    simulated: list[tuple[str, str, float, float]] = []
+    simulated: session.Simulated = []
     if how.dry_run and begun_plan(out) is None:
         operator.tell("dry run on the frozen simulators")
         make = controllers(submissions, plan.track, runner)

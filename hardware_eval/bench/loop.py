@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,7 +31,7 @@ from hardware_eval.bench.controllers import (
     Lateness,
     LiveController,
 )
-from hardware_eval.bench.plan import MEASURED, PERTURBED_BREATH, PERTURBED_STEP, PlannedRun
+from hardware_eval.bench.plan import MEASURED, PERTURBED_BREATH, PERTURBED_STEP, LogLine, PlannedRun
 from hardware_eval.bench.safety import SafetySample, SafetySettings, Trip
 from hardware_eval.realtime import Clock
 from hardware_eval.wire.client import Client, LinkError, NoAnswerError, RefusedError
@@ -112,7 +112,7 @@ class BreathLog(msgspec.Struct, frozen=True):
     late: list[float] = []
     busy: list[float] = []
 
-    def line(self, run: PlannedRun, attempt: int, breath: int) -> dict[str, Any]:
+    def line(self, run: PlannedRun, attempt: int, breath: int) -> LogLine:
         """The breath as a line of the log; the pressure after the last command is none of it."""
         steps = len(self.u_in)
         rounded = {
@@ -123,7 +123,7 @@ class BreathLog(msgspec.Struct, frozen=True):
         return run.line("breath", attempt, breath=breath, **rounded, u_out=[*self.u_out])
 
     @classmethod
-    def of_line(cls, line: Mapping[str, Any]) -> BreathLog:
+    def of_line(cls, line: LogLine) -> BreathLog:
         """The breath that a line of the log holds."""
         columns: dict[str, Any] = {
             name: [math.nan if value is None else value for value in line[name]]

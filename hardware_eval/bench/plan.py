@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,9 @@ MEASURED = ("scored", "control")
 
 #: Those whose lung is as its label says.
 UNDISTURBED = ("ramp", "scored", "control")
+
+#: A line of the log.
+LogLine = dict[str, Any]
 
 #: What happens to the tube in a perturbed run.
 PERTURBATIONS = ("leak", "pinch")
@@ -76,13 +79,13 @@ class PlannedRun:
     repeat: int  #: repetition, from 1.
     perturbation: str = ""  #: what happens to the tube; empty for nothing.
 
-    def line(self, kind: str, attempt: int, **more: Any) -> dict[str, Any]:
+    def line(self, kind: str, attempt: int, **more: Any) -> LogLine:
         """A line of the log about it; ``attempt`` is how often it was begun before."""
         about = {name: getattr(self, name) for name in _LOGGED}
         return {"type": kind, "run": self.number, "attempt": attempt, **about, **more}
 
     @classmethod
-    def of_line(cls, line: Mapping[str, Any]) -> PlannedRun:
+    def of_line(cls, line: LogLine) -> PlannedRun:
         """The run that a line is about."""
         return cls(line["run"], *(line[name] for name in _LOGGED))
 
@@ -234,9 +237,7 @@ def _check(plan: Plan) -> None:
         raise InputError(f"no entry can be called {CONTROL}; that is the PID in between")
 
 
-def progress(
-    plan: Plan, lines: Iterable[Mapping[str, Any]]
-) -> tuple[list[PlannedRun], dict[int, int]]:
+def progress(plan: Plan, lines: Iterable[LogLine]) -> tuple[list[PlannedRun], dict[int, int]]:
     """How far a plan has come by its log.
 
     A run is done when it is complete, or when a check tripped that blames its controller. A run
@@ -266,7 +267,7 @@ def progress(
     return [run for run in plan.runs if run.number not in done], attempts
 
 
-def complete_runs(lines: Iterable[Mapping[str, Any]]) -> set[tuple[int, int]]:
+def complete_runs(lines: Iterable[LogLine]) -> set[tuple[int, int]]:
     """Number and attempt of the runs of a log that are complete, with enough readings to score.
 
     Nobody can say that a breath without any reading was safe, be it scored or not.

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hardware_eval.bench.loop import BreathLog
-from hardware_eval.bench.plan import Plan, PlannedRun, complete_runs, make_plan, progress
+from hardware_eval.bench.plan import LogLine, Plan, PlannedRun, complete_runs, make_plan, progress
 from ventbench.base.errors import InputError
 from ventbench.recordings.breaths import Breaths, make_breaths, write
 from ventbench.task.lungs import LUNG_IDS
@@ -65,7 +65,7 @@ class RawLog:
             self._file.write(b"\n")
             self.append(_CUT)
 
-    def append(self, line: dict[str, Any]) -> None:
+    def append(self, line: LogLine) -> None:
         """Append one line and wait until it is on the disk; an OSError names the file."""
         try:
             self._file.write(json.dumps(line, separators=(",", ":")).encode() + b"\n")
@@ -98,7 +98,7 @@ def log_of(session: Path) -> Path:
     return path
 
 
-def lines(path: Path) -> list[dict[str, Any]]:
+def lines(path: Path) -> list[LogLine]:
     """Read a log; a line that was cut off is left out.
 
     Raises:
@@ -107,7 +107,7 @@ def lines(path: Path) -> list[dict[str, Any]]:
     """
     with open(path, "rb") as file:
         raw = file.read().split(b"\n")
-    complete, tail, read = raw[:-1], raw[-1], list[dict[str, Any]]()
+    complete, tail, read = raw[:-1], raw[-1], list[LogLine]()
     for number, text in enumerate(complete):
         try:
             line = json.loads(text)
@@ -144,7 +144,7 @@ class Session:
     """What the log of a plan says, of all of its sessions."""
 
     path: Path  #: of the log.
-    logged: list[dict[str, Any]]  #: its lines.
+    logged: list[LogLine]  #: its lines.
     plan: Plan  #: what was to run.
 
     @cached_property
@@ -153,7 +153,7 @@ class Session:
         return breaths(self.logged)
 
     @cached_property
-    def ended(self) -> list[dict[str, Any]]:
+    def ended(self) -> list[LogLine]:
         """Last lines of runs that need not run again, failed or complete."""
         complete = complete_runs(self.logged)
         return [
@@ -172,13 +172,13 @@ class Session:
         """Lungs of the plan, in the protocol's order."""
         return [lung for lung in LUNG_IDS if lung in self.plan.lungs]
 
-    def of_type(self, kind: str, /, **about: Any) -> list[dict[str, Any]]:
+    def of_type(self, kind: str, /, **about: Any) -> list[LogLine]:
         """Lines of a type, with these values."""
         wanted = {"type": kind, **about}.items()
         return [line for line in self.logged if all(line.get(k) == v for k, v in wanted)]
 
     @property
-    def about(self) -> dict[str, Any]:
+    def about(self) -> LogLine:
         """The last session's line: device, operator, notes."""
         return self.of_type("session")[-1]
 
@@ -197,7 +197,7 @@ def read_session(folder: Path) -> Session:
     raise InputError(f"{path} holds no plan: no session has begun")
 
 
-def breaths(logged: list[dict[str, Any]]) -> list[LoggedBreath]:
+def breaths(logged: list[LogLine]) -> list[LoggedBreath]:
     """All breaths of a log's lines, in order."""
     finished = complete_runs(logged)
     return [

@@ -25,7 +25,7 @@ from hardware_eval.bench.loop import (
     RunResult,
     run_once,
 )
-from hardware_eval.bench.plan import CONTROL, Plan, PlannedRun, progress
+from hardware_eval.bench.plan import CONTROL, LogLine, Plan, PlannedRun, progress
 from hardware_eval.bench.raw_log import RawLog, lines
 from hardware_eval.bench.selftest import PARTS, Sheet
 from hardware_eval.realtime import take_priority
@@ -179,7 +179,7 @@ def _one(
     run: PlannedRun,
     attempts: dict[int, int],
     make_controller: MakeController,
-    log: Callable[[dict[str, Any]], None],
+    log: Callable[[LogLine], None],
     place: tuple[int, int],
 ) -> RunResult:
     done, total = place
@@ -229,7 +229,7 @@ def _one(
     return result
 
 
-def _ended(run: PlannedRun, attempt: int, status: str, reason: str) -> dict[str, Any]:
+def _ended(run: PlannedRun, attempt: int, status: str, reason: str) -> LogLine:
     return run.line("run", attempt, status=status, reason=reason)
 
 

@@ -134,6 +134,9 @@ class BreathLog(msgspec.Struct, frozen=True):
         return cls(**columns, target=waveform.target(steps, line["pip"]).tolist())
 
 
+#: Told the place and the content of each breath of a run once it ends.
+OnBreath = Callable[[int, BreathLog], None]
+
 #: Shows a breath of a run while the lung breathes out; told how many runs of the plan are done, and
 #: how many there are.
 Show = Callable[[PlannedRun, BreathLog, int, int], None]
@@ -358,7 +361,7 @@ def run_once(
     run: PlannedRun,
     controller: LiveController,
     *,
-    on_breath: Callable[[int, BreathLog], None] = lambda index, breath: None,
+    on_breath: OnBreath = lambda index, breath: None,
 ) -> RunResult:
     """Run three breaths; the lung is vented before and after, whatever happens.
 
@@ -387,7 +390,7 @@ class _Loop(Watched):
         self._asked = self._late_answers = self._limited = 0
         self._disturbed = False
 
-    def run(self, on_breath: Callable[[int, BreathLog], None]) -> RunResult:
+    def run(self, on_breath: OnBreath) -> RunResult:
         """All breaths; see :func:`run_once`."""
         try:
             with undisturbed():

@@ -113,20 +113,19 @@ class Emulator(Guard):
         self,
         service: DeviceService | Firmware,
         *,
+        begun: float,
         link: Path | None = None,
-        begun: float | None = None,
     ) -> None:
         """Open the terminal.
 
         Args:
             service: program of the device, with simulated hardware.
+            begun: zero of the program's clock on ``time.monotonic``, s.
             link: symbolic link to make to the terminal, so that its name stays.
-            begun: zero of the program's clock on ``time.monotonic``, s, if it is not now.
 
         Raises:
             InputError: if the link cannot be made.
         """
-        begun = time.monotonic() if begun is None else begun
         self._link = link
         self._slave = -1
         check_link(link)

@@ -25,7 +25,6 @@ from hardware_eval.wire.messages import (
     FLOW_STEPS,
     PRESSURE_STEPS,
     U_IN_STEPS,
-    Flag,
     content_of,
     fixed_point,
     to_frame,
@@ -45,12 +44,11 @@ _IDENTITY = struct.Struct("<c8s32sHiB")  # as in Identity, highest in 0.01 cmH2O
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Last order of the firmware: device time, s, u_in, %, and u_out; it does not tell causes."""
+    """Last order of the firmware: device time, s, u_in, %, and u_out."""
 
     time: float = 0.0
     u_in: float = 0.0
     u_out: int = 1
-    causes: Flag = Flag.NONE
 
 
 class Firmware:

@@ -95,11 +95,15 @@ class SimulatedHal:
         plant = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), plant)
         rest, signals = plant.init(start, start)
         vector, unravel = ravel_pytree(rest)
-        self._flow = signals.flow is not None
-        capabilities = Capability.SIMULATED | (Capability.FLOW if self._flow else Capability.NONE)
+        flow = Capability.NONE if signals.flow is None else Capability.FLOW
         noisy = sensor.noise > 0.0 and sensor.noise >= 0.5 * sensor.quantum
         self.identity = Identity(
-            name, calibration[:8], calibration, capabilities, highest=sensor.highest, noisy=noisy
+            name,
+            calibration[:8],
+            calibration,
+            Capability.SIMULATED | flow,
+            highest=sensor.highest,
+            noisy=noisy,
         )
 
         def advance(vector: jax.Array, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -90,10 +90,9 @@ class Probe:
         self.watchdog, self.fed = welcome.watchdog, math.inf
         return welcome
 
-    def frame(self, message: Message, step: int = 1, session: int | None = None) -> bytes:
+    def frame(self, message: Message, step: int = 1) -> bytes:
         """The frame of a message; its sequence number is ``step`` above the last one consumed."""
-        number = self.sequence + step
-        return encode(Packet(self.session if session is None else session, number, message))
+        return encode(Packet(self.session, self.sequence + step, message))
 
     def ask(
         self,
@@ -108,7 +107,7 @@ class Probe:
         ``session`` is given.
         """
         header = self.session if session is None else session, self.sequence + step
-        sent, got = self.clock.now(), self.raw(self.frame(message, step, session))
+        sent, got = self.clock.now(), self.raw(encode(Packet(*header, message)))
         self.in_time()
         if (got.session, got.sequence) != header:
             raise DiffersError(

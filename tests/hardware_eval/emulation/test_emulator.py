@@ -49,7 +49,9 @@ class PulledEmulator(LoggedEmulator):
 @pytest.fixture
 def emulator(tmp_path: Path) -> Iterator[PulledEmulator]:
     service = DeviceService(Bench(), 0.0)
-    running = PulledEmulator(service, tmp_path / "valves.csv", link=tmp_path / "lung")
+    running = PulledEmulator(
+        service, tmp_path / "valves.csv", link=tmp_path / "lung", begun=time.monotonic()
+    )
     stop = threading.Event()
     thread = threading.Thread(target=running.run, args=(stop.is_set,))
     thread.start()

@@ -77,7 +77,7 @@ def _running(image: Path, tmp_path: Path) -> Iterator[Logged]:
     begun = time.monotonic()
     wired = WiredHal(LUNG, tmp_path / "electronics.csv", begun)
     firmware = Logged(command_of(image), wired, begun)
-    emulator = Emulator(firmware, link=tmp_path / "lung")
+    emulator = Emulator(firmware, begun=begun, link=tmp_path / "lung")
     firmware.start(lambda: emulator.port.inbox.put(b""))
     # Should it get into a loop, or outlive this test, it does not take the processor with it.
     longest = realtime.LONGEST_RUN_S * 1_000_000

@@ -152,7 +152,7 @@ def load(folder: Path) -> Round:
     path = folder / FROZEN
     if not path.is_file():
         raise InputError(f"{path} is missing: there is no round; `challenge freeze` begins one")
-    frozen = schema.decoded(_FROZEN, path.read_bytes(), str(path))
+    frozen = schema.decoded(Frozen, path.read_bytes(), str(path))
     made = Round(folder, frozen, files.sha256(path))
     path = folder / BEACON
     if not path.is_file():
@@ -230,6 +230,3 @@ def _code() -> str:
         inside = file_hashes(path) if path.is_dir() else {"": files.sha256(path)}
         hashes |= {f"{path.name}/{name}": digest for name, digest in inside.items()}
     return combined_hash(hashes)
-
-
-_FROZEN = msgspec.json.Decoder(Frozen)

@@ -56,7 +56,7 @@ class SecondRun(schema.Table, frozen=True):
     """A record whose code the maintainers ran again, and what they saw."""
 
     record: schema.Sha256
-    reason: Annotated[str, msgspec.Meta(max_length=schema.MAX_TEXT, pattern=r"\S")]
+    reason: schema.Reason
     date: date
 
 
@@ -65,7 +65,7 @@ class BenchLog(schema.Table, frozen=True):
 
     record: schema.Sha256
     recording: schema.Sha256
-    witness: Annotated[str, msgspec.Meta(max_length=schema.MAX_TEXT, pattern=r"\S")]
+    witness: schema.Reason
     date: date
 
 
@@ -152,7 +152,7 @@ def check_signature(path: Path, sha256: str, keys: dict[str, Key]) -> None:
     Raises:
         InputError: if it is not such a signature, or there is no library to check it with.
     """
-    signature = schema.read_canonical(_SIGNATURE, path)
+    signature = schema.read_canonical(_Signature, path)
     if signature.record != sha256:
         raise InputError(f"{path} signs another file, {signature.record[:12]}")
     key = keys.get(signature.key)
@@ -245,6 +245,3 @@ def read_list(folder: Path) -> Attestations:
     return (
         schema.read_toml(path, Attestations, _MAX_LIST_BYTES) if path.exists() else Attestations()
     )
-
-
-_SIGNATURE = msgspec.json.Decoder(_Signature)

@@ -85,10 +85,6 @@ class Value(schema.Table, frozen=True):
         return hmac.digest(key, _PURPOSE + bytes.fromhex(frozen), "sha256")
 
 
-#: Of values as they are stored.
-DECODER = msgspec.json.Decoder(Value)
-
-
 def read(content: bytes, label: str) -> Value:
     """Read a value as relays publish it; InputError if it is none.
 
@@ -100,7 +96,7 @@ def read(content: bytes, label: str) -> Value:
         content = json.dumps(published).encode()
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         pass  # the decoder says what is wrong
-    return schema.decoded(DECODER, content, label)
+    return schema.decoded(Value, content, label)
 
 
 def _randomness(signature: str) -> str:

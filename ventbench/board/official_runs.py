@@ -400,7 +400,7 @@ def _job(work: Path, entry: str) -> Path:
 
 def _job_result(path: Path, bounds: str) -> Result:
     """Read the result that the job of an entry has left; InputError if it is of other bounds."""
-    result = schema.read_canonical(rounds.RESULT_DECODER, path)
+    result = schema.read_canonical(Result, path)
     if result.bounds != bounds:
         raise InputError(f"{path} is of other draws or bounds; remove the folder")
     return result

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -176,11 +176,6 @@ class HardwareRecord(schema.Submitted):
         return float(self.errors.mean())
 
     @cached_property
-    def by_repeat(self) -> Floats:
-        """Score of each repetition, cmH2O, shape ``(K,)``; NaN if one of its runs was stopped."""
-        return self.errors.mean(axis=(0, 1))
-
-    @cached_property
     def by_lung(self) -> Floats:
         """Mean error on each lung, cmH2O, shape ``(L,)``; NaN if a run was stopped."""
         return self.errors.mean(axis=(1, 2))
@@ -188,7 +183,8 @@ class HardwareRecord(schema.Submitted):
     @cached_property
     def spread(self) -> float:
         """Standard deviation of the score from repetition to repetition, cmH2O; or NaN."""
-        return float(np.std(self.by_repeat, ddof=1)) if self.header.repeats > 1 else float("nan")
+        by_repeat = self.errors.mean(axis=(0, 1))
+        return float(np.std(by_repeat, ddof=1)) if self.header.repeats > 1 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -204,9 +200,8 @@ class Withdrawal:
 #: Everything that a leaderboard keeps.
 AnyRecord = Record | Withdrawal | HardwareRecord
 
-_DECODER: msgspec.json.Decoder[Any] = msgspec.json.Decoder(
-    schema.ScoreContent | schema.WithdrawalContent | HardwareContent
-)
+#: What their files hold.
+_KINDS = schema.ScoreContent | schema.WithdrawalContent | HardwareContent
 
 
 def created_of(entry: AnyRecord) -> str:
@@ -220,7 +215,7 @@ def from_bytes(content: bytes, label: str) -> AnyRecord:
     Raises:
         InputError: if it is not a record.
     """
-    values = schema.read(content, label, _DECODER)
+    values = schema.read(content, label, _KINDS)
     sha256 = canonical.digest(content)
     if isinstance(values, schema.WithdrawalContent):
         return Withdrawal(sha256, values.withdraws, values.reason, values.created)
@@ -321,9 +316,10 @@ def _check_tables(content: HardwareContent, label: str) -> None:
     run = (len(protocol.SCORED_BREATHS), protocol.INSPIRATION_STEPS)
     traces = ("trace.pressure_milli_cmH2O", "trace.u_in_tenths_percent")
     shapes = dict.fromkeys(("errors", *traces), size)
-    schema.check_shapes(
-        content, label, shapes | {"safe": size[:1], "peak_pressure_cmH2O": size[:1]}
-    )
+    shapes |= dict.fromkeys(("safe", "peak_pressure_cmH2O"), size[:1])
+    for key, shape in shapes.items():
+        if not schema.has_shape(attrgetter(key)(content), shape):
+            raise InputError(f"{label}, key {key}: does not have the shape {shape}")
     for key in traces:
         table = attrgetter(key)(content)
         runs = [cell for row in table for cells in row for cell in cells if cell is not None]

@@ -54,14 +54,13 @@ _MAX_BYTES = 5_000_000
 _MAX_NAME = 80
 
 _Time = Annotated[datetime, msgspec.Meta(tz=True)]
-_Name = Annotated[str, schema.matching(canonical.ROUND_NAME)]
 _Account = Annotated[str, schema.matching(r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,62}[A-Za-z0-9])?")]
 
 
 class Opened(schema.Table, frozen=True):
     """Content of ``round.toml``."""
 
-    name: _Name  #: of the round.
+    name: schema.RoundName  #: of the round.
     opened: _Time  #: when, UTC.
     closes: _Time  #: when entries are frozen at the earliest, UTC.
     #: least time from the freeze to the beacon's value, s.
@@ -115,13 +114,6 @@ class Result(schema.Table, frozen=True):
     records: dict[str, schema.Sha256]
     failed: dict[str, str] = msgspec.field(default_factory=dict)
     seeds: dict[str, list[float]] = msgspec.field(default_factory=dict)
-
-
-#: Of results: of a round, and of the job of an entry.
-RESULT_DECODER = msgspec.json.Decoder(Result)
-
-#: Of files of commands of seeds, by entry and track.
-SEEDS_DECODER = msgspec.json.Decoder(dict[str, list[schema.Commands]])
 
 
 class Notes(schema.Table, frozen=True):
@@ -239,11 +231,11 @@ def load(leaderboard: Path, name: str) -> Round:
         sha256 = files.sha256(folder / FROZEN)
         round_ = replace(round_, frozen=frozen, frozen_sha256=sha256)
     if BEACON in there:
-        value = schema.read_canonical(beacon.DECODER, folder / BEACON)
+        value = schema.read_canonical(Value, folder / BEACON)
         beacon.check(value, opened.chain, round_.number, str(folder / BEACON))
         round_ = replace(round_, value=value, seeds=seed_commands(folder))
     if RESULT in there:
-        result = schema.read_canonical(RESULT_DECODER, folder / RESULT)
+        result = schema.read_canonical(Result, folder / RESULT)
         round_ = replace(round_, result=result)
     return round_
 
@@ -251,7 +243,8 @@ def load(leaderboard: Path, name: str) -> Round:
 def seed_commands(folder: Path) -> dict[str, list[schema.Commands]]:
     """Files of commands of seeds, of a round or of the job of an entry; none without the file."""
     path = folder / canonical.SEEDS
-    return schema.read_canonical(SEEDS_DECODER, path) if path.exists() else {}
+    kind = dict[str, list[schema.Commands]]
+    return schema.read_canonical(kind, path) if path.exists() else {}
 
 
 def names(leaderboard: Path) -> list[str]:
@@ -463,7 +456,7 @@ def read_requests(path: Path) -> list[Any]:
     Raises:
         InputError: if it is no such file.
     """
-    return schema.decoded(_REQUESTS, path.read_bytes(), str(path))
+    return schema.decoded(list[Any], path.read_bytes(), str(path))
 
 
 def _seconds(when: datetime | None) -> datetime:
@@ -475,6 +468,3 @@ def _toml(path: Path, kind: type[schema.TableT]) -> schema.TableT:
         return schema.read_toml(path, kind, _MAX_BYTES)
     except FileNotFoundError:
         raise InputError(f"{path} is not there: there is no such round") from None
-
-
-_REQUESTS = msgspec.json.Decoder(list[Any])

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from datetime import datetime
-from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -63,10 +62,12 @@ def _among(choices: Iterable[str]) -> msgspec.Meta:
 
 
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT)]
+Reason = Annotated[str, msgspec.Meta(max_length=MAX_TEXT, pattern=r"\S")]
 Sha256 = Annotated[str, matching("[0-9a-f]{64}")]
 Time = Annotated[str, matching(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z")]
 LungId = Annotated[str, _among(LUNG_IDS)]
 EntryName = Annotated[str, matching(NAME.pattern)]
+RoundName = Annotated[str, matching(canonical.ROUND_NAME)]
 Family = Annotated[str, _among(FAMILIES)]
 Track = Annotated[str, _among(TRACKS)]
 
@@ -136,7 +137,7 @@ class Draws(Table, frozen=True):
     count: Annotated[int, msgspec.Meta(ge=1, lt=2**53)]
     sha256: Sha256
     version: Count
-    season: Annotated[str, matching("[a-z0-9][a-z0-9-]{0,39}")]
+    season: RoundName
 
     def to_json(self) -> dict[str, Any]:
         """As the record has it."""
@@ -210,18 +211,16 @@ class WithdrawalContent(Table, frozen=True, tag_field="kind", tag="withdrawal"):
     format: Version
     created: Time
     withdraws: Sha256
-    reason: Annotated[str, msgspec.Meta(max_length=MAX_TEXT, pattern=r"\S")]
+    reason: Reason
 
 
-def read(
-    content: bytes, label: str, decoder: msgspec.json.Decoder[Any]
-) -> SubmittedContent | WithdrawalContent:
-    """Read and check the content of a record of the kinds of a decoder.
+def read(content: bytes, label: str, kinds: Any) -> SubmittedContent | WithdrawalContent:
+    """Read and check the content of a record of one of some kinds.
 
     Raises:
         InputError: naming the first key that is wrong; ``label`` names the file.
     """
-    record = decoded(decoder, content, label)
+    record = decoded(kinds, content, label)
     for key, expected in (("format", FORMAT), ("protocol", PROTOCOL)):
         recorded = getattr(record, key, expected)
         if recorded != expected:
@@ -237,8 +236,6 @@ def read(
         check_free(value, f"{label}, key {key}")
     if isinstance(record, WithdrawalContent):
         return record
-    if isinstance(record, ScoreContent):
-        _check_claims(record, label)
     _check_submission(record.submission, f"{label}, key submission")
     for why in filter(None, map(deceptive, record.submission.manifest.authors)):
         raise InputError(f"{label}, key submission.manifest.authors: {why}")
@@ -248,14 +245,14 @@ def read(
     return record
 
 
-def decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
-    """Decode JSON.
+def decoded(kind: type[T], content: bytes, label: str) -> T:
+    """Decode JSON of a kind.
 
     Raises:
         InputError: naming the first key that is wrong.
     """
     try:
-        return decoder.decode(content)
+        return msgspec.json.decode(content, type=kind)
     except msgspec.ValidationError as error:
         message, at, path = str(error).rpartition(" - at `$")
         if not at:
@@ -267,8 +264,8 @@ def decoded(decoder: msgspec.json.Decoder[T], content: bytes, label: str) -> T:
         raise InputError(f"{label} is not JSON of a record: {_short(str(error))}") from None
 
 
-def read_canonical(decoder: msgspec.json.Decoder[T], path: Path) -> T:
-    """Decode a file of canonical JSON.
+def read_canonical(kind: type[T], path: Path) -> T:
+    """Decode a file of canonical JSON of a kind.
 
     Raises:
         InputError: naming the first key that is wrong, or if it is not canonical.
@@ -276,7 +273,7 @@ def read_canonical(decoder: msgspec.json.Decoder[T], path: Path) -> T:
     """
     content = files.read_limited(path, MAX_BYTES)
     canonical.parse(content, str(path))
-    return decoded(decoder, content, str(path))
+    return decoded(kind, content, str(path))
 
 
 def read_toml(path: Path, kind: type[TableT], most: int) -> TableT:
@@ -315,13 +312,6 @@ def check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
         check_free(part, where, depth - 1)
 
 
-def check_shapes(record: Any, label: str, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Check the shapes of tables by their dotted keys; InputError names the first wrong one."""
-    for key, shape in shapes.items():
-        if not has_shape(attrgetter(key)(record), shape):
-            raise InputError(f"{label}, key {key}: does not have the shape {shape}")
-
-
 def has_shape(table: Any, shape: tuple[int, ...]) -> bool:
     """Whether nested lists have a shape."""
     if len(table) != shape[0]:
@@ -330,6 +320,10 @@ def has_shape(table: Any, shape: tuple[int, ...]) -> bool:
 
 
 def _check_consistent(record: ScoreContent, label: str) -> None:
+    if record.track not in record.submission.manifest.tracks:
+        raise InputError(f"{label}, key track: the submission does not enter it")
+    if record.official and not (record.sandbox and record.sandbox.get("official") is True):
+        raise InputError(f"{label}, key official: its sandbox was not official")
     stress, steps = record.stress, [protocol.BREATHS, protocol.INSPIRATION_STEPS]
     if stress is not None and record.track != "robustness":
         raise InputError(f"{label}, key stress: belongs to the robustness track")
@@ -348,13 +342,6 @@ def _check_consistent(record: ScoreContent, label: str) -> None:
         cells = [(x.condition, x.lung, x.pip, x.draw) for x in failures or ()]
         if len(set(cells)) < len(cells):
             raise InputError(f"{label}, key {key}: names a cell twice")
-
-
-def _check_claims(record: ScoreContent, label: str) -> None:
-    if record.track not in record.submission.manifest.tracks:
-        raise InputError(f"{label}, key track: the submission does not enter it")
-    if record.official and not (record.sandbox and record.sandbox.get("official") is True):
-        raise InputError(f"{label}, key official: its sandbox was not official")
 
 
 def _check_submission(submission: RecordedSubmission, where: str) -> None:

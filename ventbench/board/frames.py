@@ -218,7 +218,7 @@ COLUMNS = (
     ),
     Column(("reasons",), lambda x: plain("; ".join(x.reasons)), "why it is not ranked"),
     Column(("created",), lambda x: x.record.header.created, "when it was scored, UTC"),
-    Column(("draws",), lambda x: x.record.header.draws.season, "name of the draws"),
+    Column(("draws",), lambda x: x.record.draws, "name of the draws"),
     Column(("record",), lambda x: x.record.sha256, "SHA-256 of the record"),
     Column(
         ("submission",),
@@ -287,7 +287,7 @@ def load_cells(folder: Path | str | None = None, *, track: str | None = None) ->
         draw, lung, pip = np.indices(figures.error.shape).reshape(3, -1)
         columns = {
             "track": record.track,
-            "draws": record.header.draws.season,
+            "draws": record.draws,
             "name": record.name,
             "lung": np.array(LUNG_IDS)[lung],
             "pip": np.array(protocol.PIPS)[pip],
@@ -337,7 +337,7 @@ def markdown(tracks: Sequence[Track]) -> str:
     cells: dict[str, dict[str, list[str]]] = {}
     for row in listed:
         record, score = row.record, row.normalised
-        if record.header.draws.season != listed[0].record.header.draws.season:
+        if record.draws != listed[0].record.draws:
             continue
         rank = str(row.place.rank) if row.place else row.status
         if row.place and row.place.range:

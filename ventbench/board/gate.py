@@ -45,7 +45,7 @@ def simulated(record: Record, leaderboard: Store) -> tuple[str, ...]:
         why.insert(0, "not official: its sandbox lacked a layer, or there was none")
     elif not official(record, leaderboard):
         why.insert(0, UNATTESTED)
-    round_ = leaderboard.seeded.get(record.header.draws.season)
+    round_ = leaderboard.round_of(record)
     if round_ is None:
         why.append(PRACTICE)
     elif round_.commitment != record.header.draws.sha256:

@@ -135,7 +135,7 @@ def rerun(
         elif code is None:
             why = "no folder at hand has the files that it names; give --source DIR"
         else:
-            round_ = board.seeded.get(score.header.draws.season)
+            round_ = board.round_of(score)
             todo[score.sha256] = score, round_, code, folder.resolve(), load, runner
             continue
         outcomes[score.sha256] = Outcome(score, NOT_RERUN, why)

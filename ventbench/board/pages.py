@@ -67,7 +67,7 @@ def environment() -> jinja2.Environment:
 
 def address(record: Record) -> str:
     """Address of the entry of a record; names are checked when records are read."""
-    return f"entries/{record.header.draws.season}/{record.track}/{record.name}.html"
+    return f"entries/{record.draws}/{record.track}/{record.name}.html"
 
 
 @functools.cache

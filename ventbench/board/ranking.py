@@ -193,8 +193,8 @@ def board(leaderboard: Store) -> tuple[Track, ...]:
     """Rank all records: both tracks of every round, the newest first, and practice last."""
     grouped: dict[tuple[str, str], dict[str, list[Record]]] = defaultdict(dict)
     for record in (x for x in leaderboard.scores if x.derived):
-        season = record.header.draws.season
-        histories = grouped[season if season in leaderboard.seeded else DEVELOPMENT, record.track]
+        draws = record.draws if leaderboard.round_of(record) else DEVELOPMENT
+        histories = grouped[draws, record.track]
         histories.setdefault(record.name, []).insert(0, record)
     tracks = [
         _track(leaderboard, draws, name, grouped[draws, name])

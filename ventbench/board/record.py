@@ -66,6 +66,11 @@ class Record(schema.Submitted):
         return self.header.track
 
     @property
+    def draws(self) -> str:
+        """Name of its draws: of a round, or ``"development"``."""
+        return self.header.draws.season
+
+    @property
     def official(self) -> bool:
         """Whether it was scored in a sandbox that deserves the word."""
         return self.header.official
@@ -84,7 +89,7 @@ class Record(schema.Submitted):
     @property
     def key(self) -> tuple[str, str, str]:
         """Draws, track and name: what one entry of the board is known by."""
-        return self.header.draws.season, self.track, self.name
+        return self.draws, self.track, self.name
 
 
 class Device(schema.Table, frozen=True):
@@ -191,10 +196,8 @@ class HardwareRecord(schema.Submitted):
 class Withdrawal:
     """Takes a record back; its entry is not ranked until a newer one arrives."""
 
-    sha256: str
-    withdraws: str
-    reason: str
-    created: str
+    sha256: str  #: of its bytes: its name.
+    header: schema.WithdrawalContent  #: its content.
 
 
 #: Everything that a leaderboard keeps.
@@ -202,11 +205,6 @@ AnyRecord = Record | Withdrawal | HardwareRecord
 
 #: What their files hold.
 _KINDS = schema.ScoreContent | schema.WithdrawalContent | HardwareContent
-
-
-def created_of(entry: AnyRecord) -> str:
-    """When a record was made, UTC."""
-    return entry.created if isinstance(entry, Withdrawal) else entry.header.created
 
 
 def from_bytes(content: bytes, label: str) -> AnyRecord:
@@ -218,7 +216,7 @@ def from_bytes(content: bytes, label: str) -> AnyRecord:
     values = schema.read(content, label, _KINDS)
     sha256 = canonical.digest(content)
     if isinstance(values, schema.WithdrawalContent):
-        return Withdrawal(sha256, values.withdraws, values.reason, values.created)
+        return Withdrawal(sha256, values)
     if isinstance(values, HardwareContent):
         return _checked(values, sha256, label)
     assert isinstance(values, schema.ScoreContent)

@@ -290,7 +290,7 @@ def with_figures(
             break
         path = store.path_of(leaderboard.folder, record.sha256)
         try:
-            round_ = leaderboard.seeded.get(record.header.draws.season)
+            round_ = leaderboard.round_of(record)
             folder = leaderboard.folder / RECORDS
             derived = derived_of(record, folder, simulators, round_, memo, cached=cached)
         except (InputError, OSError) as error:
@@ -397,7 +397,7 @@ def require_replay(
     Raises:
         InputError: if it was scored on other simulators or draws, or cannot be honest.
     """
-    round_ = leaderboard.seeded.get(added.header.draws.season)
+    round_ = leaderboard.round_of(added)
     figures = derived_of(added, folder, simulators, round_, {})
     if added.track == "robustness" and figures.leak:
         name = store.path_of(folder, added.sha256).name

@@ -45,7 +45,7 @@ class Store:
     def withdrawn(self) -> dict[str, str]:
         """Why records were taken back, by hash."""
         return {
-            x.withdraws: x.reason
+            x.header.withdraws: x.header.reason
             for x in self.records
             if isinstance(x, Withdrawal) and x.sha256 in self.attested
         }
@@ -54,6 +54,10 @@ class Store:
     def seeded(self) -> dict[str, Round]:
         """Rounds that have draws, by name."""
         return {x.name: x for x in self.rounds if x.value is not None}
+
+    def round_of(self, score: Record) -> Round | None:
+        """Round on whose draws a record was scored; None for practice."""
+        return self.seeded.get(score.draws)
 
     @property
     def scores(self) -> list[Record]:
@@ -106,8 +110,8 @@ def in_order(records: Iterable[AnyRecord]) -> tuple[AnyRecord, ...]:
 
     def place(entry: AnyRecord) -> tuple[str, bool, str]:
         takes_back = isinstance(entry, Withdrawal)
-        earlier = by_hash.get(entry.withdraws, entry) if takes_back else entry
-        created = max(record.created_of(entry), record.created_of(earlier))
+        earlier = by_hash.get(entry.header.withdraws, entry) if takes_back else entry
+        created = max(entry.header.created, earlier.header.created)
         return created, takes_back, entry.sha256
 
     return tuple(sorted(by_hash.values(), key=place))
@@ -214,7 +218,7 @@ def withdraw(folder: Path, sha256: str, reason: str) -> Withdrawal:
     """
     store = load(folder)
     withdrawn = find_record(store, sha256).sha256
-    if any(isinstance(x, Withdrawal) and x.withdraws == withdrawn for x in store.records):
+    if any(isinstance(x, Withdrawal) and x.header.withdraws == withdrawn for x in store.records):
         raise InputError(f"record {withdrawn[:12]} is withdrawn already")
     content = record.withdrawal(withdrawn, reason)
     withdrawal = record.from_bytes(content, "the withdrawal")
@@ -234,16 +238,17 @@ def conflicts(records: Sequence[AnyRecord], start: int = 0) -> list[str]:
     first: dict[str, Record] = {}  # on each draws, by their name
     counting: dict[tuple[str, str, str], Record] = {}  # of each entry, by draws, track and name
     # Whenever it was withdrawn: a record that was made before may be added after.
-    withdrawn = {entry.withdraws for entry in records if isinstance(entry, Withdrawal)}
+    withdrawn = {x.header.withdraws for x in records if isinstance(x, Withdrawal)}
     withdrawn_before: set[str] = set()
     for index, entry in enumerate(records):
         name, problems = f"record {entry.sha256}", list[str]()
         if isinstance(entry, Withdrawal):
-            if not isinstance(by_hash.get(entry.withdraws), Record | HardwareRecord):
-                problems = [f"{name} withdraws {entry.withdraws[:12]}, which is not there"]
-            elif entry.withdraws in withdrawn_before:
-                problems = [f"{name} withdraws {entry.withdraws[:12]} once more"]
-            withdrawn_before.add(entry.withdraws)
+            sha256 = entry.header.withdraws
+            if not isinstance(by_hash.get(sha256), Record | HardwareRecord):
+                problems = [f"{name} withdraws {sha256[:12]}, which is not there"]
+            elif sha256 in withdrawn_before:
+                problems = [f"{name} withdraws {sha256[:12]} once more"]
+            withdrawn_before.add(sha256)
         elif entry.sha256 in by_hash:
             problems = [f"{name} is on the leaderboard already"]
         elif isinstance(entry, Record):

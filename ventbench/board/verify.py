@@ -209,7 +209,7 @@ def _unaccounted(round_: Round, leaderboard: Store) -> list[str]:
     a failure, and there is no other record of these draws; but a correction, once it is withdrawn.
     """
     path, result, runs = round_.folder / rounds.RESULT, round_.result, round_.runs
-    records = {x.sha256: x for x in leaderboard.scores if x.header.draws.season == round_.name}
+    records = {x.sha256: x for x in leaderboard.scores if x.draws == round_.name}
     if result is None:
         return [f"{path} is missing: records are of the round's draws"] if records else []
     problems = [

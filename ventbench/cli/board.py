@@ -103,7 +103,7 @@ def withdraw(
     from ventbench.board import attestation, store
 
     withdrawal = store.withdraw(folder, record, reason)
-    typer.echo(f"withdrew {withdrawal.withdraws}")
+    typer.echo(f"withdrew {withdrawal.header.withdraws}")
     secret = os.environ.get(attestation.SECRET, "")
     if secret:
         attestation.sign(folder, store.path_of(folder, withdrawal.sha256), secret)

@@ -35,14 +35,13 @@ from ventbench.board.schema import Commands, RecordedFailure, ScoreContent
 from ventbench.board.store import Store
 from ventbench.entries import cells as scored
 from ventbench.entries.cells import Cells, Index, ProtocolRun, as_float64, gather
-from ventbench.entries.reference import published, reference_of
+from ventbench.entries.reference import published
 from ventbench.entries.runs import DRAWS, Runs
 from ventbench.entries.scoring import runs_of
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
 from ventbench.task import draws as draw_tables
 from ventbench.task import environment, protocol, rollouts, stressors
-from ventbench.task.draws import Draws
 from ventbench.task.environment import Scenario
 from ventbench.task.interfaces import Plant
 from ventbench.task.lungs import LUNG_IDS
@@ -58,10 +57,6 @@ TOLERANCE = 1e-9
 
 class ReplayPlants(Protocol):
     """What :func:`ventbench.plants.frozen.load` returns."""
-
-    @property
-    def plants(self) -> Any:
-        """Stacked over the lungs."""
 
     @property
     def ensemble(self) -> Any:
@@ -154,22 +149,16 @@ def _failed(failures: Sequence[RecordedFailure], cells: Cells) -> list[tuple[int
     Raises:
         InputError: if there is no such cell.
     """
-    conditions = [condition.id for condition in cells.conditions]
-    lungs, draws = [lung.id for lung in cells.lungs], cells.draw.tolist()
+    named = {cells.name(at): at for at in np.ndindex(len(cells.conditions), *cells.pips.shape)}
     indices = []
     for failure in failures:
-        try:
-            at = (
-                conditions.index(failure.condition),
-                lungs.index(failure.lung),
-                draws.index(failure.draw or 0),
-            )
-            indices.append((*at, cells.pips[at[1], at[2]].tolist().index(failure.pip)))
-        except ValueError:
+        cell = (failure.condition, failure.lung, failure.pip, failure.draw or None)
+        if cell not in named:
             raise InputError(
                 f"key failures: there is no cell {failure.condition}, {failure.lung}, "
                 f"PIP {failure.pip:g}, draw {failure.draw}"
-            ) from None
+            )
+        indices.append(named[cell])
     return indices
 
 
@@ -234,37 +223,25 @@ def figures_of(
     )
 
 
-def draws_of(header: ScoreContent, simulators: ReplayPlants, round_: Round | None) -> Draws:
-    """Make the draws that a record names again: the development draws, or those of its round.
+def protocol_of(
+    header: ScoreContent, simulators: ReplayPlants, round_: Round | None
+) -> scored.Protocol:
+    """Cells and bounds of the draws that a record names: the development draws, or its round's.
 
     Raises:
-        InputError: if they are neither.
+        InputError: if the draws are neither, or the bounds are of others.
     """
     rigs = rigs_of(simulators)
     draws = rigs.draws(draw_tables.COUNT) if round_ is None else round_.draws(rigs)
     if draws.about() != header.draws.to_json():
         raise InputError("key draws: neither the development draws nor those of a round")
-    return draws
-
-
-def protocol_of(
-    header: ScoreContent, simulators: ReplayPlants, round_: Round | None
-) -> scored.Protocol:
-    """Cells and bounds of the draws that a record names; arguments as of :func:`draws_of`.
-
-    Raises:
-        InputError: if there are none.
-    """
-    rigs, draws = rigs_of(simulators), draws_of(header, simulators, round_)
-    reference = reference_of(
-        rigs.about, draws.about(), published() if round_ is None else round_.bounds()
-    )
+    reference = published() if round_ is None else round_.bounds()
     return scored.protocol_of(rigs, drawn=draws, stress=DRAWS, reference=reference)
 
 
 def with_figures(
     leaderboard: Store,
-    simulators: ReplayPlants | None,
+    simulators: ReplayPlants,
     problem: Callable[[str], object],
     *,
     note: Callable[[str], object] = lambda text: None,
@@ -276,7 +253,7 @@ def with_figures(
 
     Args:
         leaderboard: without them.
-        simulators: None derives nothing.
+        simulators: that replay them.
         problem: told why a record has none, and of a record whose lung was known.
         note: told whose stressed commands are not at hand.
         progress: called after each record.
@@ -286,8 +263,6 @@ def with_figures(
     memo = {} if memo is None else memo
     replayed: dict[str, Record] = {}
     for at, record in enumerate(leaderboard.scores):
-        if simulators is None:
-            break
         path = store.path_of(leaderboard.folder, record.sha256)
         try:
             round_ = leaderboard.round_of(record)
@@ -322,9 +297,11 @@ def load(folder: Path, simulators: Load | None = None) -> Store:
     def problem(text: str) -> None:
         raise InputError(text)
 
-    leaderboard, cached = store.load(folder), simulators is None
+    leaderboard = store.load(folder)
     plants = loaded(simulators or frozen.load, problem) if leaderboard.scores else None
-    return with_figures(leaderboard, plants, problem, memo=_MEMO, cached=cached)
+    if plants is None:
+        return leaderboard
+    return with_figures(leaderboard, plants, problem, memo=_MEMO, cached=simulators is None)
 
 
 #: Figures of this process.

@@ -130,25 +130,25 @@ def verify(
     problems += _changed_since(leaderboard)
     for round_ in read:
         problems += _unaccounted(round_, leaderboard)
-        if simulators is not None:
-            problems += _other_protocol(round_, simulators, memo)
-    leaderboard = with_figures(
-        leaderboard,
-        simulators,
-        problems.append,
-        note=report.notes.append,
-        progress=progress,
-        memo=memo,
-    )
-    report.replayed = sum(score.derived is not None for score in leaderboard.scores)
-    problems += _below_bounds(leaderboard)
     if simulators is not None:
         for round_ in read:
-            problems += _wrong_seeds(round_, leaderboard, simulators, memo)
-    if simulators is not None and not problems:  # else what is wrong moves ranks and pages
-        problems += _check_published(leaderboard, site, folder.parent / "README.md", memo)
+            problems += _other_protocol(round_, simulators, memo)
+        leaderboard = with_figures(
+            leaderboard,
+            simulators,
+            problems.append,
+            note=report.notes.append,
+            progress=progress,
+            memo=memo,
+        )
+        problems += _below_bounds(leaderboard)
         for round_ in read:
-            _recompute(round_, simulators, recomputed, report, memo)
+            problems += _wrong_seeds(round_, leaderboard, simulators, memo)
+        if not problems:  # else what is wrong moves ranks and pages
+            problems += _check_published(leaderboard, site, folder.parent / "README.md", memo)
+            for round_ in read:
+                _recompute(round_, simulators, recomputed, report, memo)
+    report.replayed = sum(score.derived is not None for score in leaderboard.scores)
     report.problems = list(dict.fromkeys(problems))
     return report
 

@@ -56,6 +56,16 @@ class Cells:
     rig: Ints  #: session of each lung, ``(L, n)``.
     member: Ints  #: member of the ensemble, ``(L, n)``.
 
+    def name(self, at: tuple[int, ...]) -> tuple[str, str, float, int | None]:
+        """Condition, lung, PIP and draw of a cell ``(S, L, n, P)``; the nominal run has no draw."""
+        condition, lung, draw, pip = at
+        return (
+            self.conditions[condition].id,
+            self.lungs[lung].id,
+            float(self.pips[lung, draw, pip]),
+            int(self.draw[draw]) or None,
+        )
+
     def batches(self) -> Iterator[tuple[Index, Sequence[Plant], Scenario]]:
         """Cells that run side by side: index in ``(S, L, n, P)``, plants of each breath, scenario.
 

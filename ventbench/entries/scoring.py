@@ -275,14 +275,9 @@ def runs_of(
         requested=flat(run.requested),
         failures=[
             CellFailure(
-                cells.conditions[s].id,
-                lungs[lung],
-                float(cells.pips[lung, draw, at]),
-                int(cells.draw[draw]) or None,
-                failure,
-                failure.message(submission.label, tasks[lung].lung),
+                *cells.name(at), failure, failure.message(submission.label, tasks[at[1]].lung)
             )
-            for (s, lung, draw, at), failure in sorted(run.failures.items())
+            for at, failure in sorted(run.failures.items())
             if submission is not None
         ],
     )

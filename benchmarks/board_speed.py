@@ -20,6 +20,7 @@ import typer
 from ventbench.board import build, canonical, create, record, store
 from ventbench.board.replay import ReplayPlants, run_of
 from ventbench.board.verify import verify
+from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol, runs_of
 from ventbench.plants import frozen
@@ -33,7 +34,9 @@ FACTORS = (1.0, 0.99, 0.98, 0.97, 0.96, 0.95, 0.94, 0.93)
 
 def drafts(plants: ReplayPlants) -> list[create.Draft]:
     """Return real records whose commands are those of the PID times a factor."""
-    result = run_protocol(open_submission("pid_best"), rigs_of(plants), draws=draw_tables.COUNT)
+    result = run_protocol(
+        open_submission("pid_best"), protocol_of(rigs_of(plants), draws=draw_tables.COUNT)
+    )
     made = []
     for factor in FACTORS:
         cells, requested = result.protocol.cells, result.requested * factor

@@ -13,7 +13,7 @@ from ci import workflow
 from ci.take import PARENT, TakeError, changed_submissions, take
 from ventbench.base.text import number
 from ventbench.entries import contract
-from ventbench.entries.cells import Runner
+from ventbench.entries.cells import Runner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.manifest import MANIFEST
 from ventbench.entries.result import Score
@@ -65,7 +65,9 @@ def advise(
         if submission.manifest.name != name:
             return False, [*lines, f"{name}: submission.toml calls it {submission.manifest.name}"]
         for track in submission.manifest.tracks:
-            result = run_protocol(submission, rigs, track=track, draws=draws, runner=runner)
+            result = run_protocol(
+                submission, protocol_of(rigs, draws=draws), track=track, runner=runner
+            )
             lines.append(f"{name}: {track}: {figures(result)}")
             failed = [failure.message for failure in result.failures[:3]]
             lines += [message.replace(str(taken.folder), name) for message in failed]

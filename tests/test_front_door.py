@@ -18,6 +18,7 @@ import pytest
 import ventbench
 from ventbench.controllers.pid import PID
 from ventbench.entries import scoring
+from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.plants.rigs import load_rigs
 from ventbench.sandbox.pipes import SandboxError
@@ -208,7 +209,7 @@ def test_a_folder_runs_apart_unless_told_otherwise(monkeypatch):
     entry, rigs = open_submission("pid_best"), load_rigs("physics")
     for work in (
         lambda: DOOR.score("pid_best", simulator="physics"),
-        lambda: scoring.run_protocol(entry, rigs),
+        lambda: scoring.run_protocol(entry, protocol_of(rigs)),
     ):
         with pytest.raises(SandboxError, match="apart"):
             work()

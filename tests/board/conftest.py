@@ -142,9 +142,7 @@ def scores(
     for name in ("pid_best", "pid_robust"):
         result = run_protocol(
             open_submission(name),
-            simulators.scored(),
-            drawn=drawn,
-            reference=reference,
+            protocol_of(simulators.scored(), drawn=drawn, reference=reference),
             runner=InProcessRunner(),
         )
         rigs = dataclasses.replace(result.protocol.rigs, sha256=frozen.MANIFEST_SHA256)

@@ -27,7 +27,7 @@ from ventbench.board.rounds import Request
 from ventbench.board.verify import verify
 from ventbench.cli import app
 from ventbench.entries import reference as references
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import (
     Submission,
     as_submission,
@@ -399,7 +399,9 @@ def test_compiled_code_that_came_after_the_freeze_does_not_run(fresh: Path, tmp_
     rigs = load_rigs("physics")
 
     def commands(submission: Submission) -> Any:
-        return run_protocol(submission, rigs, pips=(20.0,), runner=InProcessRunner()).requested
+        return run_protocol(
+            submission, protocol_of(rigs, pips=(20.0,)), runner=InProcessRunner()
+        ).requested
 
     assert np.all(commands(open_submission(str(entry))) == 99.0), "control: Python takes it"
     assert np.all(commands(frozen_copy(entry, sha256, tmp_path / "copy")) == 1.0)
@@ -516,7 +518,10 @@ def test_a_table_of_public_files_is_worse_than_the_pid_in_a_round(
     ):
         for entry in (as_submission(LookUp), as_submission("pid_best")):
             result = run_protocol(
-                entry, rigs, track="performance", drawn=drawn, pips=pips, runner=InProcessRunner()
+                entry,
+                protocol_of(rigs, drawn=drawn, pips=pips),
+                track="performance",
+                runner=InProcessRunner(),
             )
             assert result.failures == ()
             means[name, entry.manifest.name] = result.drawn.mean()

@@ -19,7 +19,7 @@ from ventbench.controllers.residual import (
     init_parameters,
     save_policies,
 )
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
@@ -75,7 +75,10 @@ def test_numpy_and_jax_act_alike(name, track, tmp_path):
         plants = stack([single_compartment(lung) for lung in LUNGS])
         rigs = Rigs(LUNGS, plants)
         found = run_protocol(
-            open_submission(str(folder)), rigs, track=track, draws=1, runner=InProcessRunner()
+            open_submission(str(folder)),
+            protocol_of(rigs, draws=1),
+            track=track,
+            runner=InProcessRunner(),
         )
         _, every = rigs.cells(rigs.draws(1), PIPS)
         for i, lung in enumerate(LUNG_IDS):

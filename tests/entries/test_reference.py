@@ -5,6 +5,7 @@ import pytest
 
 from ventbench.base.errors import InputError
 from ventbench.entries import reference as references
+from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import submission_of
 from ventbench.entries.scoring import run_protocol
 from ventbench.task import protocol
@@ -59,7 +60,7 @@ def test_the_pid_scores_100_and_the_recorded_commands_0(rigs, found):
             p, i, d = self.gains
             return p * error + i * self.integral + d * self.derivative
 
-    score = run_protocol(submission_of(BestPID), rigs, draws=2, reference=found)
+    score = run_protocol(submission_of(BestPID), protocol_of(rigs, draws=2, reference=found))
     # A command of 0.001 % moves a score by less than a fiftieth of a point.
     np.testing.assert_allclose(np.asarray(score.normalised), 100.0, atol=0.02)
     value = score.to_json()["normalised"]
@@ -79,7 +80,7 @@ def test_the_pid_scores_100_and_the_recorded_commands_0(rigs, found):
                 self.steps = iter(next(self.breaths))
             return float(next(self.steps, 0.0))
 
-    best = run_protocol(submission_of(Witness), rigs, draws=2, reference=found)
+    best = run_protocol(submission_of(Witness), protocol_of(rigs, draws=2, reference=found))
     np.testing.assert_allclose(np.asarray(best.normalised), 0.0, atol=0.02)
 
 

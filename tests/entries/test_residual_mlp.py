@@ -31,7 +31,7 @@ from ventbench.controllers.residual import (
     save_weights,
     untrained,
 )
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
@@ -117,7 +117,9 @@ def test_the_submission_is_the_pure_controller(fields, tmp_path):
             found, _ = rollouts.closed_loop(take(plants, k), one, cells)
             errors.append(run_error(found.pressure, np.asarray(cells.pip)[..., None, None]))
     result = run_protocol(
-        open_submission(str(folder)), rigs, draws=2, pips=(10, 35), runner=InProcessRunner()
+        open_submission(str(folder)),
+        protocol_of(rigs, draws=2, pips=(10, 35)),
+        runner=InProcessRunner(),
     )
     assert not result.failures
     expected = np.stack(errors)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -39,7 +40,7 @@ class Pretender:
 def scored(plants, runner: Any = None, **options):
     rigs = plants if isinstance(plants, Rigs) else Rigs(LUNGS, plants, about=frozen.load().about())
     runner = runner or Pretender()
-    return run_protocol(open_submission("pid_robust"), rigs, runner=runner, **options)
+    return run_protocol(open_submission("pid_robust"), protocol_of(rigs, **options), runner=runner)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +103,7 @@ def test_some_lungs_alone_are_not_official(official):
 
 
 def test_words_of_the_caller_make_no_simulators_frozen(textbook):
-    assert textbook.protocol.simulators == frozen.load().about()
+    assert textbook.protocol.rigs.about == frozen.load().about()
     assert textbook.sandbox == FULL
     assert not textbook.official
     assert textbook.to_json()["official"] is False

@@ -16,7 +16,7 @@ from safetensors.numpy import save_file
 from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.entries import contract
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.manifest import FAMILIES
 from ventbench.entries.scaffold import contents, create, initial_weights
@@ -46,8 +46,7 @@ def test_is_ready_and_scores(family, tmp_path, one_lung):
     assert report.notes[0].what == "key authors still says Your Name"
     result = run_protocol(
         open_submission(str(folder)),
-        Rigs(LUNGS[:1], one_lung),
-        pips=(20.0,),
+        protocol_of(Rigs(LUNGS[:1], one_lung), pips=(20.0,)),
         track="robustness",
         runner=InProcessRunner(),
     )
@@ -60,8 +59,7 @@ def test_residual_starts_as_its_pi_controller(tmp_path, one_lung):
     def scored(folder):
         return run_protocol(
             open_submission(str(folder)),
-            Rigs(LUNGS[:1], one_lung),
-            pips=(20.0,),
+            protocol_of(Rigs(LUNGS[:1], one_lung), pips=(20.0,)),
             track="robustness",
             runner=InProcessRunner(),
         ).requested

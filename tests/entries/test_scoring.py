@@ -14,7 +14,7 @@ from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
 from ventbench.entries import cells
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol, score
 from ventbench.plants.rigs import Rigs
@@ -52,7 +52,9 @@ def pure_errors(plants, cells, gains):
 @pytest.fixture(scope="module")
 def best(plants):
     return run_protocol(
-        open_submission("pid_best"), Rigs(LUNGS, plants), draws=20, runner=InProcessRunner()
+        open_submission("pid_best"),
+        protocol_of(Rigs(LUNGS, plants), draws=20),
+        runner=InProcessRunner(),
     )
 
 
@@ -74,7 +76,7 @@ def test_robust_pid(plants):
     for track in ("robustness", "performance"):
         found = run_protocol(
             open_submission("pid_robust"),
-            Rigs(LUNGS, plants),
+            protocol_of(Rigs(LUNGS, plants)),
             track=track,
             runner=InProcessRunner(),
         )
@@ -123,7 +125,9 @@ def test_secondary_figures_are_those_of_the_lung(best, plants):
 
 def test_deterministic(best, plants):
     again = run_protocol(
-        open_submission("pid_best"), Rigs(LUNGS, plants), draws=20, runner=InProcessRunner()
+        open_submission("pid_best"),
+        protocol_of(Rigs(LUNGS, plants), draws=20),
+        runner=InProcessRunner(),
     )
     first, second = best.to_json(), again.to_json()
     assert set(first.pop("timing")) == set(second.pop("timing"))
@@ -159,7 +163,9 @@ def test_parts(best, plants):
     own = dataclasses.replace(drawn, cells=jax.tree.map(lambda x: x[[5, 0]], drawn.cells))
     own = dataclasses.replace(own, rig=drawn.rig[[5, 0]], member=drawn.member[[5, 0]])
     found = run_protocol(
-        open_submission("pid_best"), rigs, drawn=own, pips=[35.0, 10.0], runner=InProcessRunner()
+        open_submission("pid_best"),
+        protocol_of(rigs, drawn=own, pips=[35.0, 10.0]),
+        runner=InProcessRunner(),
     )
     np.testing.assert_allclose(found.nominal, best.nominal[[5, 0]][:, [5, 0]], atol=1e-12)
     np.testing.assert_allclose(found.drawn, best.drawn[:2, [5, 0]][:, :, [5, 0]], atol=1e-12)
@@ -171,7 +177,7 @@ def test_parts(best, plants):
 
 def test_without_draws(plants):
     result = run_protocol(
-        open_submission("pid_best"), Rigs(LUNGS, plants), runner=InProcessRunner()
+        open_submission("pid_best"), protocol_of(Rigs(LUNGS, plants)), runner=InProcessRunner()
     ).to_json()
     assert result["draws"] is None
     assert result["lungs"]["R5C10"]["draws"] is None
@@ -182,10 +188,14 @@ def test_compiles_once(plants):
     for function in compiled:
         function.clear_cache()
     run_protocol(
-        open_submission("pid_best"), Rigs(LUNGS, plants), draws=1, runner=InProcessRunner()
+        open_submission("pid_best"),
+        protocol_of(Rigs(LUNGS, plants), draws=1),
+        runner=InProcessRunner(),
     )
     run_protocol(
-        open_submission("pid_robust"), Rigs(LUNGS, plants), draws=1, runner=InProcessRunner()
+        open_submission("pid_robust"),
+        protocol_of(Rigs(LUNGS, plants), draws=1),
+        runner=InProcessRunner(),
     )
     assert [function._cache_size() for function in compiled] == [1, 1]
 
@@ -208,9 +218,8 @@ def test_what_a_submission_is_told(make, plants, track, known):
     folder = make(source)
     run_protocol(
         open_submission(str(folder)),
-        Rigs(LUNGS, plants),
+        protocol_of(Rigs(LUNGS, plants), draws=1),
         track=track,
-        draws=1,
         runner=InProcessRunner(),
     )
     runs = [json.loads(line) for line in (folder.parent / "log").read_text().splitlines()]
@@ -242,9 +251,8 @@ def test_failed_cells(make, plants):
         """
     found = run_protocol(
         open_submission(str(make(act=act))),
-        Rigs(LUNGS, plants),
+        protocol_of(Rigs(LUNGS, plants), draws=1),
         track="performance",
-        draws=1,
         runner=InProcessRunner(),
     )
     result = found.to_json()
@@ -274,7 +282,9 @@ def test_failed_cells(make, plants):
 def test_failure_in_a_draw(make, plants):
     act = "return 3.0 if observation.target in (10, 15, 20, 25, 30, 35) else None"
     result = run_protocol(
-        open_submission(str(make(act=act))), Rigs(LUNGS, plants), draws=2, runner=InProcessRunner()
+        open_submission(str(make(act=act))),
+        protocol_of(Rigs(LUNGS, plants), draws=2),
+        runner=InProcessRunner(),
     ).to_json()
     assert result["score"] is None
     assert result["draws"]["score"] is None
@@ -288,7 +298,9 @@ def test_failure_in_a_draw(make, plants):
 def test_all_cells_fail_before_the_first_step(make, plants):
     source = "class Controller:\n def reset(self): pass\n def act(self, o): return 0.0\n"
     result = run_protocol(
-        open_submission(str(make(source))), Rigs(LUNGS, plants), runner=InProcessRunner()
+        open_submission(str(make(source))),
+        protocol_of(Rigs(LUNGS, plants)),
+        runner=InProcessRunner(),
     ).to_json()
     assert len(result["failures"]) == 36
     assert "raised TypeError in reset (lung hidden)" in result["failures"][0]["message"]
@@ -298,7 +310,7 @@ def test_unsafe_lung(make, plants):
     act = "return 100.0 if self.task.lung == 'R5C10' else 0.0"
     found = run_protocol(
         open_submission(str(make(act=act))),
-        Rigs(LUNGS, plants),
+        protocol_of(Rigs(LUNGS, plants)),
         track="performance",
         runner=InProcessRunner(),
     )
@@ -311,7 +323,9 @@ def test_unsafe_lung(make, plants):
 def test_clipping(make, plants):
     act = "return -1.0 if observation.time == 0 else 101.0 if observation.time > 0.95 else 1.0"
     result = run_protocol(
-        open_submission(str(make(act=act))), Rigs(LUNGS, plants), runner=InProcessRunner()
+        open_submission(str(make(act=act))),
+        protocol_of(Rigs(LUNGS, plants)),
+        runner=InProcessRunner(),
     ).to_json()
     assert result["lungs"]["R5C10"]["clipped"] == {
         "below": 18,
@@ -326,7 +340,7 @@ def test_wrong_track(plants):
     with pytest.raises(SubmissionError, match="enters performance; it cannot be scored for robus"):
         run_protocol(
             open_submission("pid_best"),
-            Rigs(LUNGS, plants),
+            protocol_of(Rigs(LUNGS, plants)),
             track="robustness",
             runner=InProcessRunner(),
         )
@@ -335,24 +349,32 @@ def test_wrong_track(plants):
 def test_too_many_draws(plants):
     with pytest.raises(InputError, match="20 development draws"):
         run_protocol(
-            open_submission("pid_best"), Rigs(LUNGS, plants), draws=21, runner=InProcessRunner()
+            open_submission("pid_best"),
+            protocol_of(Rigs(LUNGS, plants), draws=21),
+            runner=InProcessRunner(),
         )
 
 
 def test_plants_of_other_lungs(plants):
     with pytest.raises(ValueError, match="not stacked over 2 lungs"):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS[:2], plants), runner=InProcessRunner())
+        run_protocol(
+            open_submission("pid_best"),
+            protocol_of(Rigs(LUNGS[:2], plants)),
+            runner=InProcessRunner(),
+        )
 
 
 def test_broken_simulator_is_no_score(plants):
     broken = dataclasses.replace(plants, C=np.array([10.0, 20.0, np.nan, 10.0, 20.0, 50.0]))
     with pytest.raises(FloatingPointError, match="simulator 2 answered with NaN"):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS, broken), runner=InProcessRunner())
+        run_protocol(
+            open_submission("pid_best"), protocol_of(Rigs(LUNGS, broken)), runner=InProcessRunner()
+        )
 
 
 def test_code_that_cannot_be_imported(make, plants):
     with pytest.raises(SubmissionError, match=r"controller.py line 1: "):
-        run_protocol(open_submission(str(make("x = (\n"))), Rigs(LUNGS, plants))
+        run_protocol(open_submission(str(make("x = (\n"))), protocol_of(Rigs(LUNGS, plants)))
 
 
 class Recorder:
@@ -380,7 +402,9 @@ class Recorder:
 
 def test_another_runner(plants):
     runner: Any = Recorder()
-    found = run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), draws=1, runner=runner)
+    found = run_protocol(
+        open_submission("pid_best"), protocol_of(Rigs(LUNGS, plants), draws=1), runner=runner
+    )
     assert len(runner.rows) == 102
     assert all(rows.shape == (72, 15) and rows.dtype == np.float64 for rows in runner.rows)
     assert [task.lung for task in runner.tasks[::12]] == list(LUNG_IDS)
@@ -401,7 +425,7 @@ def test_session_is_closed_when_the_loop_breaks(plants):
 
     runner: Any = Breaks()
     with pytest.raises(KeyboardInterrupt):
-        run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), runner=runner)
+        run_protocol(open_submission("pid_best"), protocol_of(Rigs(LUNGS, plants)), runner=runner)
     assert runner.closed == 1
 
 
@@ -430,8 +454,7 @@ def test_jax_in_a_submission_is_as_elsewhere(make, plants):
     part = jax.tree.map(lambda leaf: leaf[:1], plants)
     found = run_protocol(
         open_submission(str(make(act=act))),
-        Rigs(LUNGS[:1], part),
-        pips=[10.0],
+        protocol_of(Rigs(LUNGS[:1], part), pips=[10.0]),
         runner=InProcessRunner(),
     )
     assert found.failures == ()
@@ -439,7 +462,9 @@ def test_jax_in_a_submission_is_as_elsewhere(make, plants):
 
 def test_nothing_is_left_on_the_search_path(plants):
     before = list(sys.path)
-    run_protocol(open_submission("pid_best"), Rigs(LUNGS, plants), runner=InProcessRunner())
+    run_protocol(
+        open_submission("pid_best"), protocol_of(Rigs(LUNGS, plants)), runner=InProcessRunner()
+    )
     assert sys.path == before
 
 

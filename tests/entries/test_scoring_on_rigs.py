@@ -9,7 +9,7 @@ import pytest
 
 from ventbench.base import compilation
 from ventbench.controllers.pid import PID
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission, submission_of
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -34,7 +34,9 @@ def rigs():
 @pytest.fixture(scope="module")
 def result(rigs):
     return run_protocol(
-        open_submission("pid_robust"), rigs, draws=4, pips=PIPS, runner=InProcessRunner()
+        open_submission("pid_robust"),
+        protocol_of(rigs, draws=4, pips=PIPS),
+        runner=InProcessRunner(),
     )
 
 
@@ -66,7 +68,7 @@ def test_scores_the_airway_and_shows_the_reading(rigs):
         seen.append(observation.pressure)
         return 0.0
 
-    quiet = run_protocol(submission_of(watch), rigs, pips=(10.0,))
+    quiet = run_protocol(submission_of(watch), protocol_of(rigs, pips=(10.0,)))
     # The valve stays closed: the airway stays at PEEP, the sensor shows more.
     np.testing.assert_allclose(quiet.nominal, 5.0)
     assert max(seen) == pytest.approx(5.0 + OFFSET)
@@ -79,7 +81,9 @@ def test_draws_run_on_the_rigs_that_they_name(rigs, result):
     first = np.zeros_like(drawn.rig) + np.array([own[0] for own in rigs.sessions])[:, None]
     forced = dataclasses.replace(drawn, rig=first, member=np.zeros_like(drawn.member))
     again = run_protocol(
-        open_submission("pid_robust"), rigs, drawn=forced, pips=PIPS, runner=InProcessRunner()
+        open_submission("pid_robust"),
+        protocol_of(rigs, drawn=forced, pips=PIPS),
+        runner=InProcessRunner(),
     )
     changed = np.any(again.drawn != result.drawn, axis=2).T
     elsewhere = (drawn.rig != forced.rig) | (drawn.member > 0)
@@ -101,7 +105,9 @@ def test_trajectories_are_those_of_the_nominal_cells(result):
 
 
 def test_simulators_with_one_rig_can_be_scored():
-    answer = run_protocol(submission_of(lambda o: 4.0), load_rigs("physics"), draws=1, pips=(10.0,))
+    answer = run_protocol(
+        submission_of(lambda o: 4.0), protocol_of(load_rigs("physics"), draws=1, pips=(10.0,))
+    )
     assert answer.nominal.shape == (6, 1)
     assert answer.rig_draws is not None
     assert not answer.rig_draws.rig.any()
@@ -112,7 +118,9 @@ def test_simulators_with_one_rig_can_be_scored():
 def test_the_frozen_rigs_can_be_scored():
     official = rigs_of(frozen.load())
     result = run_protocol(
-        open_submission("pid_robust"), official, draws=2, pips=PIPS, runner=InProcessRunner()
+        open_submission("pid_robust"),
+        protocol_of(official, draws=2, pips=PIPS),
+        runner=InProcessRunner(),
     )
     errors, _ = compiled(official, 2)
     np.testing.assert_allclose(result.drawn, np.moveaxis(errors[:, 1:], 1, 0), atol=1e-9)

@@ -77,11 +77,8 @@ def runs(score: Score) -> Runs:
 def _scored(controller: Any) -> Score:
     return run_protocol(
         submission_of(controller),
-        load_rigs(),
+        protocol_of(load_rigs(), pips=(10.0,), stress=1, stressors=NAMES),
         track="robustness",
-        pips=(10.0,),
-        stress=1,
-        stressors=NAMES,
     )
 
 
@@ -283,7 +280,11 @@ def test_json_and_tables_say_the_same(score: Score, runs: Runs, tmp_path: Path) 
 
 def test_an_entry_that_must_be_told_its_lung_is_refused() -> None:
     with pytest.raises(SubmissionError, match="does not tell the lung"):
-        run_protocol(open_submission("pid_best"), load_rigs(), stress=1, runner=InProcessRunner())
+        run_protocol(
+            open_submission("pid_best"),
+            protocol_of(load_rigs(), stress=1),
+            runner=InProcessRunner(),
+        )
 
 
 @pytest.mark.slow

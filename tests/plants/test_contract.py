@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from ventbench.base.compilation import float64
 from ventbench.entries import scoring
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.physics import physics
 from ventbench.plants import frozen
@@ -340,6 +340,6 @@ def test_a_new_family_is_one_file_and_one_line(make_recording, tmp_path, monkeyp
     np.testing.assert_array_equal(again, answers)
     rigs = Rigs(simulators.lungs, simulators.stacked)
     score = scoring.run_protocol(
-        open_submission("pid_best"), rigs, pips=(10.0,), runner=InProcessRunner()
+        open_submission("pid_best"), protocol_of(rigs, pips=(10.0,)), runner=InProcessRunner()
     )
     assert np.isfinite(score.score)

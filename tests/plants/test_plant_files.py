@@ -14,7 +14,7 @@ from ventbench.base import compilation
 from ventbench.base import files as whole_files
 from ventbench.base.errors import InputError
 from ventbench.cli import app
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.physics import physics
 from ventbench.plants import frozen, plant_files
 from ventbench.plants.corrected import Corrected
@@ -204,7 +204,7 @@ def test_score_on_the_plants_of_a_file(tmp_path: Path) -> None:
     assert plain["simulators"]["sha256"] == whole_files.sha256(path)
     wanted = run_protocol(
         open_submission("pid_best"),
-        Rigs(tuple(map(lung, plants)), stack_heterogeneous(list(plants.values()))),
+        protocol_of(Rigs(tuple(map(lung, plants)), stack_heterogeneous(list(plants.values())))),
         runner=InProcessRunner(),
     )
     assert plain["score"] == pytest.approx(wanted.score, abs=1e-12)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ventbench.base import compilation
-from ventbench.entries.cells import InProcessRunner
+from ventbench.entries.cells import InProcessRunner, protocol_of
 from ventbench.entries.folder import open_submission
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
@@ -43,9 +43,13 @@ def test_scores_are_those_of_the_plain_process():
     for name in ("pid_best", "pid_robust"):
         submission = open_submission(name)
         runner = SandboxRunner(allowance=PATIENT)
-        apart = run_protocol(submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,), runner=runner)
+        apart = run_protocol(
+            submission, protocol_of(Rigs(LUNGS, plants), draws=1, pips=(20.0,)), runner=runner
+        )
         plain = run_protocol(
-            submission, Rigs(LUNGS, plants), draws=1, pips=(20.0,), runner=InProcessRunner()
+            submission,
+            protocol_of(Rigs(LUNGS, plants), draws=1, pips=(20.0,)),
+            runner=InProcessRunner(),
         )
         assert not apart.failures
         np.testing.assert_array_equal(apart.nominal, plain.nominal)

@@ -15,6 +15,7 @@ from ventbench.base import compilation
 from ventbench.base.errors import InputError
 from ventbench.cli import app
 from ventbench.controllers.pid import PID
+from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import submission_of
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
@@ -181,7 +182,7 @@ def test_an_error_on_draws_is_that_of_the_scorer():
             self.integral += a * (error - self.integral)
             return 2.0 * error + 4.0 * self.integral
 
-    score = run_protocol(submission_of(Controller), rigs, drawn=drawn)
+    score = run_protocol(submission_of(Controller), protocol_of(rigs, drawn=drawn))
     assert score.controllable is not None
     # The environment rounds a submission's commands to 0.001 %.
     np.testing.assert_allclose(found[0], score.controllable[2, 1], atol=1e-4)

@@ -16,7 +16,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,6 +33,7 @@ from ventbench.board.canonical import RECORDS, SEEDS
 from ventbench.board.record import Record
 from ventbench.board.replay import Load, ReplayPlants, protocol_of, require_replay, seed_scores
 from ventbench.board.rounds import BOUNDS, RESULT, Entered, Result, Round
+from ventbench.entries import cells
 from ventbench.entries import reference as references
 from ventbench.entries.cells import Runner
 from ventbench.entries.folder import (
@@ -178,15 +179,11 @@ def _run(
     header, closest, simulators, apart = score.header, list[str](), load(), runner()
     try:
         protocol_ = protocol_of(header, simulators, round_)
+        if header.stress is None:
+            protocol_ = replace(protocol_, stressed=None)
         with TemporaryDirectory() as place:
-            result = run_protocol(
-                frozen_copy(code, header.submission.sha256, Path(place)),
-                protocol_.rigs,
-                track=score.track,
-                stress=0 if header.stress is None else DRAWS,
-                runner=apart,
-                drawn=protocol_.drawn,
-            )
+            submission = frozen_copy(code, header.submission.sha256, Path(place))
+            result = run_protocol(submission, protocol_, track=score.track, runner=apart)
         runs: list[tuple[Any, ...]] = [
             (header.commands, result.requested, result.failures, header.failures)
         ]
@@ -420,8 +417,10 @@ def _score_entry(
     Leaves its records, commands of its seeds, and its part of the result, in a folder of its own.
     """
     round_, simulators = rounds.load(leaderboard, name), load()
-    rigs = rigs_of(simulators)
-    draws, bounds, apart = round_.draws(rigs), round_.bounds(), runner()
+    rigs, apart = rigs_of(simulators), runner()
+    draws, bounds = round_.draws(rigs), round_.bounds()
+    under_stress = cells.protocol_of(rigs, drawn=draws, stress=DRAWS, reference=bounds)
+    unstressed = replace(under_stress, stressed=None)
     job_result, folder = Result(files.sha256(round_.folder / BOUNDS), {}), _job(work, entry.name)
     of_seeds: dict[str, list[schema.Commands]] = {}
     with TemporaryDirectory() as place:
@@ -432,15 +431,8 @@ def _score_entry(
                 submission = frozen_copy(code, entry.sha256, at)
                 if seed:
                     submission = with_seed(submission, seed, at / "seed")
-                result = run_protocol(
-                    submission,
-                    rigs,
-                    track=track,
-                    drawn=draws,
-                    reference=bounds,
-                    stress=DRAWS if track == "robustness" and not seed else 0,
-                    runner=apart,
-                )
+                protocol_ = under_stress if track == "robustness" and not seed else unstressed
+                result = run_protocol(submission, protocol_, track=track, runner=apart)
                 if seed:
                     if result.failures:
                         raise InputError("a cell failed")

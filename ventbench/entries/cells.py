@@ -111,11 +111,6 @@ class Protocol:
     #: simulators and draws.
     reference: Reference | None
 
-    @property
-    def simulators(self) -> Mapping[str, Any]:
-        """Version and hashes of the plants."""
-        return self.rigs.about
-
 
 def protocol_of(
     rigs: Rigs,

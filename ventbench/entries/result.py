@@ -189,7 +189,7 @@ class Score:
                 "sha256": self.submission.sha256,
                 **dataclasses.asdict(manifest),
             },
-            "simulators": dict(self.protocol.simulators),
+            "simulators": dict(self.protocol.rigs.about),
             "versions": package_versions(),
             "timing": dict(self.timing),
         }

@@ -17,6 +17,7 @@ from ventbench.base.executor import Progress
 from ventbench.entries.cells import (
     ROUNDS,
     Cells,
+    Protocol,
     ProtocolRun,
     Runner,
     counted,
@@ -26,14 +27,12 @@ from ventbench.entries.cells import (
 )
 from ventbench.entries.folder import Submission, as_submission
 from ventbench.entries.manifest import TRACKS
-from ventbench.entries.reference import Reference
 from ventbench.entries.result import Score
 from ventbench.entries.runs import PLATEAU_SHARE, PLATEAU_TOLERANCE, CellFailure, Runs
 from ventbench.plants.catalog import SimulatorLike
-from ventbench.plants.rigs import Rigs, load_rigs
+from ventbench.plants.rigs import load_rigs
 from ventbench.sandbox.child.cell import SubmissionError
 from ventbench.task import protocol
-from ventbench.task.draws import Draws
 from ventbench.task.interfaces import Task
 from ventbench.task.metrics.score import (
     InspirationSignals,
@@ -98,16 +97,9 @@ def score(
         False
     """
     entry = as_submission(submission)
-    result = run_protocol(
-        entry,
-        load_rigs(simulator),
-        track=track,
-        draws=draws,
-        stress=stress,
-        stressors=stressors,
-        runner=runner_of(entry, sandbox=sandbox),
-        progress=progress,
-    )
+    runner = runner_of(entry, sandbox=sandbox)
+    protocol_ = protocol_of(load_rigs(simulator), draws=draws, stress=stress, stressors=stressors)
+    result = run_protocol(entry, protocol_, track=track, runner=runner, progress=progress)
     if len(result.failures) == result.requested[..., 0, 0].size and entry.sha256 is None:
         first = result.failures[0]  # a class or function that never works
         raise SubmissionError(first.message) from first.failure.cause
@@ -116,57 +108,42 @@ def score(
 
 def run_protocol(
     submission: Submission,
-    rigs: Rigs,
+    protocol_: Protocol,
     *,
     track: str | None = None,
-    draws: int = 0,
-    drawn: Draws | None = None,
-    reference: Reference | None = None,
-    pips: Sequence[float] = protocol.PIPS,
-    stress: int = 0,
-    stressors: Sequence[str] = (),
     runner: Runner | None = None,
     progress: Progress | None = None,
 ) -> Score:
     """Run a submission through the protocol, on any rigs and by any runner.
 
-    Rigs are from :func:`ventbench.plants.rigs.load_rigs`; what is run is as of
-    :func:`ventbench.entries.cells.protocol_of`, on the manifest's first track if none is given.
-    Without a runner a folder runs in the sandbox, a class or function in this process.
-    ``progress`` is called after each round of commands with rounds done and all rounds.
+    What is run is from :func:`ventbench.entries.cells.protocol_of`, on the manifest's first track
+    if none is given. Without a runner a folder runs in the sandbox, a class or function in this
+    process. ``progress`` is called after each round of commands with rounds done and all rounds.
 
     Raises:
         SubmissionError: if the submission cannot be run at all, or does not enter the track.
-        InputError: if there are no such draws, or the reference is of others.
         ValueError: if the plants are not those of the lungs.
         FloatingPointError: if a plant answers with NaN or infinity.
     """
     started = time.perf_counter()
     runner = runner or runner_of(submission, sandbox=True)
-    names = tuple(lung.id for lung in rigs.lungs)
+    names = tuple(lung.id for lung in protocol_.rigs.lungs)
     track, tasks = enter(submission, track, names, runner)
-    if stress and track != "robustness":
+    stressed = protocol_.stressed
+    if stressed is not None and track != "robustness":
         raise SubmissionError(
             f"{submission.label}: submission.toml, key tracks: is scored for {track}; missing "
             "physics does not tell the lung and needs an entry of the robustness track"
         )
-    scoring_protocol = protocol_of(
-        rigs,
-        draws=draws,
-        drawn=drawn,
-        pips=pips,
-        stress=stress,
-        stressors=stressors,
-        reference=reference,
-    )
-    count = counted(progress, (1 + stress) * ROUNDS)
+    stressed_draws = 0 if stressed is None else len(stressed.draw)
+    count = counted(progress, (1 + stressed_draws) * ROUNDS)
     with compilation.float64():
-        run = run_cells(scoring_protocol.cells, runner, submission, tasks, count)
+        run = run_cells(protocol_.cells, runner, submission, tasks, count)
         under_stress = None
-        if scoring_protocol.stressed is not None:
-            stressed = run_cells(scoring_protocol.stressed, runner, submission, tasks, count)
-            under_stress = runs_of(stressed, scoring_protocol.stressed, submission, tasks)
-    scenario = scoring_protocol.cells.scenario
+        if stressed is not None:
+            run_under_stress = run_cells(stressed, runner, submission, tasks, count)
+            under_stress = runs_of(run_under_stress, stressed, submission, tasks)
+    scenario = protocol_.cells.scenario
     inspired = run.u_in[0, :, 0]
     fixed = expiratory_command(np.arange(protocol.INSPIRATION_STEPS, protocol.BREATH_STEPS))
     fixed = np.broadcast_to(fixed, (*inspired.shape[:-1], len(fixed)))
@@ -187,14 +164,12 @@ def run_protocol(
     return Score(
         submission=submission,
         track=track,
-        protocol=scoring_protocol,
-        runs=runs_of(run, scoring_protocol.cells, submission, tasks),
+        protocol=protocol_,
+        runs=runs_of(run, protocol_.cells, submission, tasks),
         stressed=under_stress,
         controllable=controllable,
         figures=figures(InspirationSignals(*signals, *levels)),
-        trajectories=end_to_end(
-            submission.manifest.name, track, names, scoring_protocol.pips, *joined
-        ),
+        trajectories=end_to_end(submission.manifest.name, track, names, protocol_.pips, *joined),
         sandbox=runner.sandbox,
         timing={
             "seconds": time.perf_counter() - started,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import submission_of
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants.rigs import Rigs
@@ -77,8 +78,7 @@ def test_one_line_in_the_registry_brings_a_figure_into_scores_and_under_the_cont
     plants = stack([single_compartment(LUNGS[0])])
     score = run_protocol(
         submission_of(lambda seen: 2.0 * (seen.target - seen.pressure)),
-        Rigs(LUNGS[:1], plants),
-        pips=(20.0,),
+        protocol_of(Rigs(LUNGS[:1], plants), pips=(20.0,)),
     )
     assert list(score.figures) == list(FIGURES)
     assert score.figures["peak_cmH2O"].shape == (1, 1, 2)

@@ -19,6 +19,7 @@ from ventbench.entries import reference as references
 from ventbench.entries.cells import InProcessRunner
 from ventbench.entries.result import Score
 from ventbench.plants import frozen as plants
+from ventbench.task import attainable
 from ventbench.task import draws as draw_tables
 
 from . import referee
@@ -28,7 +29,7 @@ pytest.importorskip("jinja2", reason="needs the extra ventbench[view]")
 
 #: What the tests of the board do without, see `conftest.py`; and what is replaced here.
 WITNESS, SECOND = references.witness_errors, references.second_errors
-SECONDS, RUN, BOUNDS_OF = rounds._seconds, official_runs.run_protocol, official_runs.bounds_of
+SECONDS, RUN = rounds._seconds, official_runs.run_protocol
 
 #: Draws of these rounds, starts of their bounds, and cells where these are found again.
 DRAWS, STARTS, AGAIN = 6, (1, 4, 16), 2
@@ -42,8 +43,7 @@ def small(monkeypatch: pytest.MonkeyPatch, simulators) -> None:
     monkeypatch.setattr(draw_tables, "COUNT", DRAWS)
     monkeypatch.setattr(references, "witness_errors", WITNESS)
     monkeypatch.setattr(references, "second_errors", SECOND)
-    of_few = lambda *x, starts, **y: BOUNDS_OF(*x, starts=STARTS, **y)  # noqa: E731
-    monkeypatch.setattr(official_runs, "bounds_of", of_few)
+    monkeypatch.setattr(attainable, "STARTS", STARTS)
     for function in (official_runs.bound, official_runs.score, official_runs.close):
         defaults: Any = function.__kwdefaults__
         monkeypatch.setitem(defaults, "load", lambda: simulators)

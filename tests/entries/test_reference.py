@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from ventbench.base.errors import InputError
+from ventbench.base.executor import InProcess
 from ventbench.entries import reference as references
 from ventbench.entries.cells import protocol_of
 from ventbench.entries.folder import submission_of
 from ventbench.entries.scoring import run_protocol
-from ventbench.task import protocol
+from ventbench.task import attainable, protocol
 
 from ..textbook_rigs import TextbookRigs
 
@@ -31,9 +32,16 @@ def inputs(rigs):
     )
 
 
+def computed(inputs, folder, starts=(1,), **options):
+    """Bounds from few starts."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(attainable, "STARTS", starts)
+        return references.compute(*inputs, folder=folder, pool=InProcess(), **options)
+
+
 @pytest.fixture(scope="module")
-def found(inputs):
-    return references.compute(*inputs, starts=(1,))
+def found(inputs, tmp_path_factory):
+    return computed(inputs, tmp_path_factory.mktemp("parts"))
 
 
 def test_bounds_are_in_order(found):
@@ -103,14 +111,14 @@ def test_an_interrupted_computation_continues(inputs, found, tmp_path):
 
     folder = tmp_path / "parts"
     with pytest.raises(Stop):
-        references.compute(*inputs, folder=folder, starts=(1,), progress=stop)
+        computed(inputs, folder, progress=stop)
     kept = {path.name: path.stat().st_mtime_ns for path in folder.glob("draw-*.npy")}
     assert sorted(kept) == ["draw-0.0.npy", "draw-1.0.npy"]
-    again = references.compute(*inputs, folder=folder, starts=(1,))
+    again = computed(inputs, folder)
     np.testing.assert_array_equal(again.attainable, found.attainable)
     assert all((folder / name).stat().st_mtime_ns == then for name, then in kept.items())
     with pytest.raises(InputError, match="other settings"):
-        references.compute(*inputs, folder=folder, starts=(2,))
+        computed(inputs, folder, starts=(2,))
 
 
 def test_a_reference_of_other_draws_is_refused(rigs, found):

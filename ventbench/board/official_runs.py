@@ -50,7 +50,7 @@ from ventbench.entries.runs import DRAWS
 from ventbench.entries.scoring import run_protocol
 from ventbench.plants import frozen
 from ventbench.plants.rigs import rigs_of
-from ventbench.task import attainable, environment, protocol
+from ventbench.task import environment, protocol
 
 #: What a second run can show.
 REPRODUCED, DIFFERENT, NOT_RERUN = "reproduced", "different", "not re-run"
@@ -269,7 +269,6 @@ def bounds_of(
     pool: Executor,
     folder: Path,
     *,
-    starts: tuple[int, ...] = attainable.STARTS,
     progress: Progress | None = None,
 ) -> Reference:
     """Best attainable and best PID of the draws of a round, with the PIDs of the protocol."""
@@ -283,7 +282,6 @@ def bounds_of(
         np.array(references.PID_GAINS),
         settings,
         folder=folder,
-        starts=starts,
         pool=pool,
         progress=progress,
     )
@@ -296,7 +294,6 @@ def bound(
     work: Path,
     *,
     load: Load = frozen.load,
-    starts: tuple[int, ...] = attainable.STARTS,
     progress: Progress | None = None,
 ) -> Round:
     """Write the bounds of a round's draws, unless they are there; runs no submission.
@@ -307,7 +304,6 @@ def bound(
         pool: executor of the draws.
         work: folder for what is finished.
         load: gives the simulators.
-        starts: see :data:`ventbench.task.attainable.STARTS`.
         progress: called with the number of cells done, and of all.
 
     Raises:
@@ -318,9 +314,7 @@ def bound(
     if different := rounds.protocol_differences(round_, simulators.about()):
         raise InputError(f"round {name} has another protocol: {', '.join(different)}")
     if not (path := round_.folder / BOUNDS).exists():
-        bounds = bounds_of(
-            round_, simulators, pool, work / "bounds", starts=starts, progress=progress
-        )
+        bounds = bounds_of(round_, simulators, pool, work / "bounds", progress=progress)
         bounds.save(path)
     rigs = rigs_of(simulators)
     references.reference_of(rigs.about, round_.draws(rigs).about(), round_.bounds())
@@ -338,7 +332,6 @@ def score(
     load: Load = frozen.load,
     runner: Callable[[], Runner] = sandboxed,
     secret: str | None = None,
-    starts: tuple[int, ...] = attainable.STARTS,
     progress: StageProgress | None = None,
 ) -> Round:
     """Score every frozen entry, write its records, and close the round.
@@ -354,7 +347,6 @@ def score(
         load: gives the simulators; outside of this process, a function of a module.
         runner: gives the runner of an entry; outside of this process, a function of a module.
         secret: key that signs the records; without one they have no rank.
-        starts: of the bounds, see :data:`ventbench.task.attainable.STARTS`.
         progress: called with what is going on, how much of it is done, and of how much.
 
     Raises:
@@ -365,9 +357,7 @@ def score(
     tell = progress or (lambda stage, completed, count: None)
     code = code_of(_load_scorable(leaderboard, name), places)
     bounds_progress = functools.partial(tell, "bounds of the draws")
-    round_ = bound(
-        leaderboard, name, pool, work, load=load, starts=starts, progress=bounds_progress
-    )
+    round_ = bound(leaderboard, name, pool, work, load=load, progress=bounds_progress)
     bounds = files.sha256(round_.folder / BOUNDS)
     chosen = [x for x in round_.entries if x.name in (only or code)]
     jobs = {

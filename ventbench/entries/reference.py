@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from ventbench.base import compilation, files
 from ventbench.base.arrays import Floats, Ints
 from ventbench.base.errors import InputError
-from ventbench.base.executor import InProcess, Progress
+from ventbench.base.executor import Progress
 from ventbench.base.resume import ARRAY, WorkFolder, fingerprint, kept_results
 from ventbench.controllers.pid import PID
 from ventbench.task import attainable, protocol, rollouts
@@ -224,9 +224,8 @@ def compute(
     gains: Floats,
     identity: Mapping[str, Any],
     *,
-    folder: Path | None = None,
-    starts: tuple[int, ...] = attainable.STARTS,
-    pool: Executor | None = None,
+    folder: Path,
+    pool: Executor,
     progress: Progress | None = None,
 ) -> Reference:
     """Compute the reference errors of cells; an interrupted call continues.
@@ -236,21 +235,19 @@ def compute(
         cells: batch shape ``(L, 1 + K, P)``, nominal cells first.
         gains: of each lung's best PID, %/cmH2O, shape ``(L, 3)``.
         identity: what the reference belongs to, see :func:`settings`.
-        folder: for finished parts; nothing is kept if not given.
-        starts: see :data:`ventbench.task.attainable.STARTS`.
-        pool: executor of the draws; this process if not given.
+        folder: for finished parts.
+        pool: executor of the draws.
         progress: called with the number of cells done, and of all.
 
     Raises:
         InputError: if the folder holds parts of another computation, or a worker died.
     """
     lungs, draws, pips = np.shape(cells.pip)
-    work = None
-    if folder is not None:
-        keys = {"about": dict(identity), "starts": starts, "iterations": attainable.ITERATIONS}
-        keys["sweeps"] = SWEEPS
-        keys["inputs"] = fingerprint((plants, cells, gains))
-        work = WorkFolder(folder, keys)
+    starts = attainable.STARTS
+    keys = {"about": dict(identity), "starts": starts, "iterations": attainable.ITERATIONS}
+    keys["sweeps"] = SWEEPS
+    keys["inputs"] = fingerprint((plants, cells, gains))
+    work = WorkFolder(folder, keys)
     report = progress or (lambda completed, total: None)
     size, total = lungs * pips, lungs * draws * pips * (1 + SWEEPS)
     parts: dict[str, Floats] = {}
@@ -264,7 +261,7 @@ def compute(
             )
             begin = starts if neighbours is None else neighbours[:, :, draw]
             jobs[f"draw-{draw}.{sweep}"] = (*draw_inputs, np.asarray(gains), begin)
-        for name, part in kept_results(work, pool or InProcess(), _part, jobs, ARRAY):
+        for name, part in kept_results(work, pool, _part, jobs, ARRAY):
             parts[name] = part
             report(len(parts) * size, total)
         stacked = np.stack([parts[name] for name in jobs], axis=1)

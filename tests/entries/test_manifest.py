@@ -117,14 +117,12 @@ def test_missing_file(tmp_path):
 
 def manifest_of(demo, text):
     (demo / "submission.toml").write_text(text)
-    findings, read = check_manifest(demo)
-    return findings, read
+    return check_manifest(demo)
 
 
 def test_manifest_problems_have_lines(demo):
     text = MANIFEST.replace('"other"', '"pdi"').replace("licence", "license")
-    findings, read = manifest_of(demo, f'{text}\n[training]\ndata = "x"\nseeds = 3\n"se\'ed" = 1\n')
-    assert read is None
+    findings = manifest_of(demo, f'{text}\n[training]\ndata = "x"\nseeds = 3\n"se\'ed" = 1\n')
     assert [(f.line, f.what) for f in findings] == [
         (3, "key license is not known; did you mean licence?"),
         (5, "key family 'pdi' is not one of pid, residual, ppo, dqn, other; did you mean pid?"),
@@ -136,15 +134,14 @@ def test_manifest_problems_have_lines(demo):
 
 
 def test_broken_toml_has_line_and_column(demo):
-    (finding,), _ = manifest_of(demo, MANIFEST + "training = = 1\n")
+    (finding,) = manifest_of(demo, MANIFEST + "training = = 1\n")
     assert (finding.line, finding.column) == (8, 12)
     assert finding.what == "not TOML: Invalid value"
 
 
 def test_what_a_manifest_says_is_looked_at(demo):
     text = MANIFEST.replace('"Apache-2.0"', '"Apache 2"') + "[training]\nper_lung = true\n"
-    findings, read = manifest_of(demo, text.replace('"other"', '"ppo"'))
-    assert read is not None
+    findings = manifest_of(demo, text.replace('"other"', '"ppo"'))
     assert [(f.problem, f.line, f.what.split(" ")[1]) for f in findings] == [
         (True, 3, "licence"),
         (False, 1, "name"),

@@ -271,8 +271,7 @@ def check(
         from ventbench.sandbox.runner import SandboxRunner
 
         runner = SandboxRunner(allowance=Allowance(total_s=120.0))
-    findings = list(inspect_folder(folder))
-    opened = None
+    findings, opened = inspect_folder(folder), None
     with contextlib.suppress(SubmissionError):  # the checks have said why
         opened = open_submission(name)
     if opened is None or any(f.problem for f in findings if f.group == "source"):
@@ -364,18 +363,13 @@ def _failure(run: ContractRun, answers: Answers, indices: list[int]) -> Finding:
     failure = answers.failures[indices[0]]
     detail = f": {failure.detail}" if failure.detail else ""
     answered = int(np.isfinite(answers.commands[indices[0]]).sum())
-    circumstances = _when(run, failure, answered)
-    more = f" (and in {len(indices) - 1} other runs)" if len(indices) > 1 else ""
-    message = f"{failure.what}{circumstances}{detail}{more}"
-    return _placed("run", message, _ADVICE.get(failure.kind, _GENERAL_ADVICE))
-
-
-def _when(run: ContractRun, failure: Failure, answered: int) -> str:
-    words = f" {run.unusual}" if run.unusual else ""
+    when = f" {run.unusual}" if run.unusual else ""
     if failure.step is not None:
         breath, step = divmod(answered, protocol.INSPIRATION_STEPS)
-        words += f" at step {step + 1} of breath {breath + 1}"
-    return f"{words} (lung {run.task.lung or 'hidden'})"
+        when += f" at step {step + 1} of breath {breath + 1}"
+    more = f" (and in {len(indices) - 1} other runs)" if len(indices) > 1 else ""
+    message = f"{failure.what}{when} (lung {run.task.lung or 'hidden'}){detail}{more}"
+    return _placed("run", message, _ADVICE.get(failure.kind, _GENERAL_ADVICE))
 
 
 def _placed(group: Group, text: str, advice: str) -> Finding:
@@ -400,22 +394,14 @@ def _clipping_notes(commands: Floats) -> Iterator[Finding]:
 
 def repetition_findings(first: Floats, repeated: Floats) -> Iterator[Finding]:
     """A finding if commands of a run, %, are others in another process."""
-    if difference := _first_difference(first, repeated):
-        message = f"the same run in another process gave {difference}"
+    for k in np.flatnonzero(first != repeated)[:1].tolist():
+        breath, step = divmod(k, protocol.INSPIRATION_STEPS)
+        message = (
+            f"the same run in another process gave {repeated[k]:.9g} % instead of {first[k]:.9g} % "
+            f"at step {step + 1} of breath {breath + 1}"
+        )
         advice = "give every random generator a fixed seed; do not look at the clock"
         yield Finding("repeat", CONTROLLER, message, advice)
-
-
-def _first_difference(first: Floats, second: Floats) -> str:
-    """Where two runs differ first; empty if nowhere."""
-    differing = np.flatnonzero(first != second)
-    if not differing.size:
-        return ""
-    k = differing[0]
-    breath, step = divmod(int(k), protocol.INSPIRATION_STEPS)
-    return (
-        f"{second[k]:.9g} % instead of {first[k]:.9g} % at step {step + 1} of breath {breath + 1}"
-    )
 
 
 def time_findings(act_seconds: Floats, acts: int = ACTS) -> Iterator[Finding]:

@@ -279,15 +279,15 @@ _GENERAL_ADVICE = "see submission.toml in submissions/README.md for the keys and
 _TOML_PLACE = re.compile(r" \(at line (\d+), column (\d+)\)")
 
 
-def check_manifest(folder: Path) -> tuple[list[Finding], Manifest | None]:
-    """Read the manifest of a folder: the findings, and the manifest unless it cannot be read."""
+def check_manifest(folder: Path) -> list[Finding]:
+    """Find what is wrong with the manifest of a folder."""
     path = folder / MANIFEST
     if not path.is_file():
-        return [], None  # reported by check_files
+        return []  # reported by check_files
     read, lines = _read(path), _lines(path)
     if isinstance(read, Manifest):
-        return list(_consistency(read, folder, lines)), read
-    return [_explained(*problem, lines) for problem in read], None
+        return list(_consistency(read, folder, lines))
+    return [_explained(*problem, lines) for problem in read]
 
 
 def _explained(key: str, message: str, lines: list[str]) -> Finding:

@@ -219,7 +219,7 @@ def _module(name: str) -> Iterator[tuple[str, str]]:
 LISTED = 200
 
 _CHECKS: Mapping[Group, Callable[[Path], list[Finding]]] = {
-    "manifest": lambda folder: check_manifest(folder)[0],
+    "manifest": check_manifest,
     "files": check_files,
     "source": check_sources,
 }
@@ -236,7 +236,7 @@ def findings_as_json(folder: str, *checks: Group) -> list[dict[str, Any]]:
     return listed
 
 
-def inspect_folder(folder: Path) -> tuple[Finding, ...]:
+def inspect_folder(folder: Path) -> list[Finding]:
     """Return what is wrong with the manifest, the files and the sources of a submission.
 
     One process makes all checks. Where a check ends the process, each check gets its own, so that
@@ -245,11 +245,11 @@ def inspect_folder(folder: Path) -> tuple[Finding, ...]:
     """
     function, findings = "ventbench.entries.review:findings_as_json", list[Finding]()
     with contextlib.suppress(UnreadableError):
-        return tuple(Finding(**fields) for fields in read_apart(function, folder, [*_CHECKS]))
+        return [Finding(**fields) for fields in read_apart(function, folder, [*_CHECKS])]
     for group in _CHECKS:
         try:
             findings += [Finding(**fields) for fields in read_apart(function, folder, [group])]
         except UnreadableError as error:
             advice = "make its files smaller and plainer"
             findings.append(Finding(group, "the folder", str(error), advice))
-    return tuple(findings)
+    return findings

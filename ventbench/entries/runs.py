@@ -164,24 +164,14 @@ class Runs:
             values = values - (sums / count)[index] + mean
         return Interval(mean, *limits(resampled_scores(values, self.rig, self.member)))
 
-    def comparable(self, baseline: Runs) -> bool:
-        """Whether another entry was run under the same conditions on the same draws."""
-        return (
-            self.conditions == baseline.conditions
-            and self.lungs == baseline.lungs
-            and all(
-                np.array_equal(getattr(self, name), getattr(baseline, name))
-                for name in ("pips", "rig", "member")
-            )
-        )
-
     def difference(self, baseline: Runs) -> Interval:
         """Stress score less that of another entry, cmH2O, and its paired 95 % interval.
 
         Raises:
             InputError: if the other one was run on other draws or under other conditions.
         """
-        if not self.comparable(baseline):
+        names = ("conditions", "lungs", "pips", "rig", "member")
+        if not all(np.array_equal(getattr(self, x), getattr(baseline, x)) for x in names):
             raise InputError("these entries were run under different conditions or draws")
         return self.interval(self.by_lung_and_draw - baseline.by_lung_and_draw)
 

@@ -19,13 +19,12 @@ from ventbench.board import canonical, frames, pages, ranking, replay
 from ventbench.board.figures import Figures
 from ventbench.board.frames import Column
 from ventbench.board.ranking import BASELINES, Row, Track
-from ventbench.board.record import Record
 from ventbench.board.replay import TRACE_BREATH, Load
 from ventbench.board.rounds import Round
 from ventbench.board.schema import ScoreContent
 from ventbench.board.store import Store
 from ventbench.task import protocol
-from ventbench.task.lungs import LUNG_IDS, LUNGS
+from ventbench.task.lungs import LUNGS
 
 if TYPE_CHECKING:
     import jinja2
@@ -111,16 +110,12 @@ def _index(
         titles=[column.title for column in columns],
         first=first,
         measured=any(track.hardware for track in tracks),
-        aside=[_aside(row) for row in entries if not row.listed],
+        aside=[row for row in entries if not row.listed],
         simulators=flatten(first.header.simulators) if first else [],
         stress=[pages.stress_context(row) for row in stressed],
         chart=pages.stress_chart(stressed),
         records=len(leaderboard.records),
-        hardware=[
-            {**pages.hardware_context(row), "track": track.name}
-            for track in tracks
-            for row in track.hardware
-        ],
+        hardware=[row for track in tracks for row in track.hardware],
         protocol=protocol,
         round=page_round,
         rounds=leaderboard.rounds,
@@ -140,17 +135,15 @@ def _telling(entries: Sequence[Row]) -> list[Column]:
 
 
 def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
-    rows = []
-    for row in track.listed:
-        measured = pages.hardware_of(track.hardware, row.record.name)
-        rows.append(
-            {
-                "cells": [column.cell(row) for column in columns],
-                "path": pages.address(row.record),
-                "baseline": row.record.name == BASELINES[track.name],
-                "hardware": None if measured is None else pages.hardware_context(measured),
-            }
-        )
+    rows = [
+        {
+            "cells": [column.cell(row) for column in columns],
+            "record": row.record,
+            "baseline": row.record.name == BASELINES[track.name],
+            "hardware": pages.hardware_of(track.hardware, row.record.name),
+        }
+        for row in track.listed
+    ]
     return {
         "id": track.name if track.round else f"practice-{track.name}",
         "name": track.name,
@@ -158,17 +151,6 @@ def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
         "about": track.title,
         "practice": track.round is None,
         "rows": rows,
-    }
-
-
-def _aside(row: Row) -> dict[str, Any]:
-    """A line of the list of entries that are not ranked."""
-    return {
-        "name": row.record.name,
-        "track": row.record.track,
-        "path": pages.address(row.record),
-        "score": pages.figure(row.error.value) if row.error else pages.NONE,
-        "reasons": row.reasons,
     }
 
 
@@ -181,7 +163,6 @@ def _entry_pages(
     baseline_paths = None if base is None else pages.paths(base.record)
     rendered: dict[str, bytes] = {}
     for row in track.rows:
-        name = row.record.name
         path = pages.address(row.record)
         compared = None if row is base else base
         values = _values(row, leaderboard)
@@ -189,10 +170,7 @@ def _entry_pages(
         values["count"] = len(track.listed)
         panels = pages.panels(pages.paths(row.record), compared and baseline_paths)
         values["panels"] = [[pages.trusted(panel) for panel in lung] for lung in panels]
-        measured = (
-            hardware_row for hardware_row in track.hardware if hardware_row.record.name == name
-        )
-        values["hardware"] = [pages.hardware_context(hardware_row) for hardware_row in measured]
+        values["hardware"] = [x for x in track.hardware if x.record.name == row.record.name]
         stressed = [row] if row in track.stress else []
         values["stress"] = pages.stress_context(stressed[0]) if stressed else None
         values["worst"] = pages.stress_order(stressed[0]) if stressed else []
@@ -219,14 +197,14 @@ def _values(row: Row, leaderboard: Store) -> dict[str, Any]:
         ],
         "scaled": pages.heat_map(_ranking(figures, figures.normalised), pages.NORMALISED_LIMITS, 0),
         "heat": pages.heat_map(_ranking(figures, figures.error), pages.ERROR_LIMITS),
-        "safety": _safety(record),
         "failures": header.failures[:MAX_FAILURES],
         "frames": [pages.trusted(pages.frame(pip)) for pip in protocol.PIPS],
         "pips": [f"{pip:g}" for pip in protocol.PIPS],
         "lungs": [(x.id, f"{x.R:g}", f"{x.C:g}") for x in LUNGS],
         "breath": TRACE_BREATH + 1,
         "provenance": _provenance(header),
-        "history": _history(row, leaderboard),
+        "history": row.history,
+        "withdrawn": leaderboard.withdrawn,
         "protocol": protocol,
         "box": f"0 0 {pages.WIDTH} {pages.HEIGHT}",
     }
@@ -235,21 +213,6 @@ def _values(row: Row, leaderboard: Store) -> dict[str, Any]:
 def _ranking(figures: Figures, values: Floats) -> Floats:
     """Nominal runs and the draws that rank, of a table of runs."""
     return values[[True, *figures.ranked]]
-
-
-def _safety(record: Record) -> list[dict[str, Any]]:
-    """A row a lung: highest pressure, longest time above the limit, whether the gate is passed."""
-    figures = record.figures
-    highest, steps = figures.peak.max(axis=(0, 2)), figures.steps_above.max(axis=(0, 2))
-    return [
-        {
-            "name": name,
-            "peak": pages.figure(float(highest[i]), 1),
-            "above": int(steps[i]),
-            "safe": bool(figures.safe[i]),
-        }
-        for i, name in enumerate(LUNG_IDS)
-    ]
 
 
 def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -267,20 +230,3 @@ def _provenance(header: ScoreContent) -> list[tuple[str, list[tuple[str, str]]]]
     )
     flat = [(title, flatten(values)) for title, values in groups]
     return [(title, rows) for title, rows in flat if rows]
-
-
-def _history(row: Row, leaderboard: Store) -> list[dict[str, Any]]:
-    """All records of the entry, newest first, and what became of each."""
-    lines = []
-    for record in row.history:
-        withdrawn = leaderboard.withdrawn.get(record.sha256)
-        state = "counts" if record.sha256 == row.record.sha256 else "does not count"
-        lines.append(
-            {
-                "sha256": record.sha256,
-                "created": record.header.created,
-                "state": state if withdrawn is None else "withdrawn",
-                "reason": withdrawn or "",
-            }
-        )
-    return lines

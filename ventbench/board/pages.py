@@ -55,6 +55,8 @@ def environment() -> jinja2.Environment:
     templates = page_templates("ventbench.board", shown=_printable)
     style, script = palette.css() + _asset("board.css"), _asset("board.js")
     templates.globals.update(
+        address=address,
+        figure=figure,
         style=trusted(style),
         script=trusted(script),
         policy=(
@@ -127,35 +129,6 @@ def hardware_of(rows: Sequence[HardwareRow], name: str) -> HardwareRow | None:
     """The row that stands for an entry: attested ones first, a physical lung before an emulator."""
     counting = [row for row in rows if row.newest and row.record.name == name]
     return min(counting, key=lambda row: (bool(row.reasons), row.record.emulated), default=None)
-
-
-def hardware_context(row: HardwareRow) -> dict[str, Any]:
-    """A hardware record for the templates: the row's fields, and texts that are made of them."""
-    record, header = row.record, row.record.header
-    stopped = not math.isfinite(record.score)
-    spread = "" if math.isnan(record.spread) else f" (SD {figure(record.spread)})"
-    return {
-        **vars(row),
-        "header": header,
-        "path": row.simulated and address(row.simulated.record),
-        "value": "" if stopped else f"{record.score:.9f}",
-        "score": "stopped" if stopped else figure(record.score),
-        "spread": spread,
-        "expected": figure(row.nominal),
-        "gap": figure(row.gap, sign=True),
-        "same_code": row.same_code,
-        "device": "emulator" if record.emulated else header.device.name,
-        "lungs": [
-            {
-                "name": lung,
-                "score": figure(float(record.by_lung[i])),
-                "peak": figure(header.peak_pressure_cmH2O[i], 1),
-                "safe": header.safe[i],
-            }
-            for i, lung in enumerate(header.lungs)
-        ],
-        "pips": ", ".join(f"{pip:g}" for pip in header.pips),
-    }
 
 
 def stress_context(row: Row) -> dict[str, Any]:

@@ -62,6 +62,12 @@ def content(leaderboard: Store) -> dict[str, bytes]:
     return built
 
 
+def inputs(folder: Path) -> dict[str, bytes]:
+    """Return what a site holds of a leaderboard besides what is built, by path."""
+    names = sorted(filter(canonical.named, canonical.walk(folder)[0]))
+    return {name: (folder / name).read_bytes() for name in names}
+
+
 def build(folder: Path, out: Path, simulators: Load | None = None) -> Built:
     """Write the site of a leaderboard into a folder: pages, CSV, and the records that they link to.
 
@@ -75,9 +81,8 @@ def build(folder: Path, out: Path, simulators: Load | None = None) -> Built:
     pages.environment()  # what it needs is missed before the replay, which may take minutes
     leaderboard = replay.load(folder, simulators)
     built = content(leaderboard)
-    named = sorted(filter(canonical.named, canonical.walk(folder)[0]))
     changed = []
-    for name, text in [*built.items(), *((name, (folder / name).read_bytes()) for name in named)]:
+    for name, text in (built | inputs(folder)).items():
         path = out / name
         if not path.is_file() or path.read_bytes() != text:
             files.write_bytes(path, text)
@@ -105,7 +110,7 @@ def _index(
     of_first = [track for track in tracks if track.draws == tracks[0].draws] if tracks else []
     stressed = [row for track in of_first for row in track.stress]
     return environment.get_template("index.html.j2").render(
-        tracks=[_track(track, columns) for track in tracks],
+        tracks=[(track, _rows(track, columns)) for track in tracks],
         columns=columns,
         titles=[column.title for column in columns],
         first=first,
@@ -134,8 +139,9 @@ def _telling(entries: Sequence[Row]) -> list[Column]:
     ]
 
 
-def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
-    rows = [
+def _rows(track: Track, columns: Sequence[Column]) -> list[dict[str, Any]]:
+    """Rows of the table of a track."""
+    return [
         {
             "cells": [column.cell(row) for column in columns],
             "record": row.record,
@@ -144,14 +150,6 @@ def _track(track: Track, columns: Sequence[Column]) -> dict[str, Any]:
         }
         for row in track.listed
     ]
-    return {
-        "id": track.name if track.round else f"practice-{track.name}",
-        "name": track.name,
-        "title": f"{'' if track.round else 'Practice: '}{track.name}".capitalize(),
-        "about": track.title,
-        "practice": track.round is None,
-        "rows": rows,
-    }
 
 
 def _entry_pages(

@@ -49,16 +49,12 @@ class Column:
         value = self.value(row)
         if value is None or isinstance(value, Interval):
             return pages.interval(value, self.digits, sign=self.sign)
-        if not isinstance(value, float):
-            return {"text": str(value), "small": self.small(row), "value": value, "kind": ""}
-        exists = math.isfinite(value)
-        text = f"{pages.figure(value, self.digits)}{self.unit if exists else ''}"
-        return {
-            "text": text,
-            "small": self.small(row),
-            "value": f"{value:.9g}" if exists else "",
-            "kind": "",
-        }
+        text = str(value)
+        if isinstance(value, float):
+            exists = math.isfinite(value)
+            text = f"{pages.figure(value, self.digits)}{self.unit if exists else ''}"
+            value = f"{value:.9g}" if exists else ""
+        return {"text": text, "small": self.small(row), "value": value, "kind": ""}
 
     def values(self, row: Row) -> tuple[Any, ...]:
         """Values by :attr:`names`; NaN or None where there is none."""

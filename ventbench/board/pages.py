@@ -27,6 +27,7 @@ from ventbench.base.arrays import Floats
 from ventbench.base.interval import Interval
 from ventbench.base.text import number, page_templates, plain
 from ventbench.board.ranking import HardwareRow, Row, stressed_runs
+from ventbench.entries.runs import order
 from ventbench.task import protocol
 from ventbench.task.lungs import LUNG_IDS
 from ventbench.task.stressors import CATEGORIES, SEVERITIES, Condition, conditions, stressor
@@ -136,10 +137,7 @@ def stress_context(row: Row) -> dict[str, Any]:
     runs = stressed_runs(row)
     figures = runs.headline()
     return {
-        "name": row.record.name,
-        "place": row.stress_place,
-        "path": address(row.record),
-        "family": row.record.manifest.family,
+        "row": row,
         "score": None if row.stress is None else interval(row.stress, 2),
         "unstressed": number(figures["unstressed"], 2),
         "unstressed_survived": f"{100 * figures['survived_unstressed']:.0f}",
@@ -161,12 +159,9 @@ def stress_order(row: Row) -> list[dict[str, str]]:
     runs that it leaves, ``survived``, %. A condition in which a run failed comes first.
     """
     by_condition = stressed_runs(row).by_condition[1:]
-
-    def rise(figures: dict[str, Any]) -> float:
-        return math.inf if figures["rise_cmH2O"] is None else figures["rise_cmH2O"]
-
+    most_first = sorted(by_condition, key=lambda row: order(row["rise_cmH2O"]), reverse=True)
     lines = []
-    for figures in sorted(by_condition, key=rise, reverse=True)[:WORST]:
+    for figures in most_first[:WORST]:
         low, high = figures["rise_ci95"]
         lines.append(
             {

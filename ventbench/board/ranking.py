@@ -237,8 +237,9 @@ def _track(
         status = "not ranked" if why else status
         status = status if gate.official(record, leaderboard) else "not official"
         result, key = round_ and round_.result, key_of(record.name, record.track)
-        counts = result is not None and result.records.get(key) == record.sha256
-        seeds = result.seeds.get(key, ()) if result and counts else ()
+        seeds: Sequence[float] = ()
+        if result and result.records.get(key) == record.sha256:
+            seeds = result.seeds.get(key, ())
         rows[status].append(Row(record, tuple(history), status, why, seeds))
     listed = rank(derived(leaderboard, rows["ranked"] + rows["practice"]))
     return Track(name, draws, round_, (*listed, *rows["not ranked"], *rows["not official"]))
@@ -312,8 +313,8 @@ def _places(
     names = [row.record.name for row in rows]
     source = [names.index(x.source) if x.source in names else None for x in rows]
     computed = comparison.ranks(np.stack(values), rig, source, matters=matters)
-    columns = (computed.rank.tolist(), computed.best.tolist(), computed.worst.tolist())
-    return [Place(*place) for place in zip(*columns, strict=True)]
+    places = zip(computed.rank, computed.best, computed.worst, strict=True)
+    return [Place(*map(int, place)) for place in places]
 
 
 def _ranked_under_stress(rows: list[Row]) -> list[Row]:

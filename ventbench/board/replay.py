@@ -244,9 +244,9 @@ def with_figures(
     simulators: ReplayPlants,
     problem: Callable[[str], object],
     *,
+    memo: Memo,
     note: Callable[[str], object] = lambda text: None,
     progress: Progress | None = None,
-    memo: Memo | None = None,
     cached: bool = False,
 ) -> Store:
     """Derive the figures of all records of a leaderboard.
@@ -255,12 +255,11 @@ def with_figures(
         leaderboard: without them.
         simulators: that replay them.
         problem: told why a record has none, and of a record whose lung was known.
+        memo: what earlier calls of this process derived; adds to it.
         note: told whose stressed commands are not at hand.
         progress: called after each record.
-        memo: what earlier calls of this process derived; adds to it.
         cached: read the user's cache, and write to it.
     """
-    memo = {} if memo is None else memo
     replayed: dict[str, Record] = {}
     for at, record in enumerate(leaderboard.scores):
         path = store.path_of(leaderboard.folder, record.sha256)
@@ -429,6 +428,7 @@ _OF_RUNS = [
     "peak",
     "volume",
     "draw",
+    "plateau_error",
 ]
 
 

@@ -228,15 +228,13 @@ def load(leaderboard: Path, name: str) -> Round:
             raise InputError(f"{folder / FROZEN}, key frozen: is before the round closed")
         if len({entry.name for entry in frozen.entries}) < len(frozen.entries):
             raise InputError(f"{folder / FROZEN}, key entries: names one twice")
-        sha256 = files.sha256(folder / FROZEN)
-        round_ = replace(round_, frozen=frozen, frozen_sha256=sha256)
+        round_ = replace(round_, frozen=frozen, frozen_sha256=files.sha256(folder / FROZEN))
     if BEACON in there:
         value = schema.read_canonical(Value, folder / BEACON)
         beacon.check(value, opened.chain, round_.number, str(folder / BEACON))
         round_ = replace(round_, value=value, seeds=seed_commands(folder))
     if RESULT in there:
-        result = schema.read_canonical(Result, folder / RESULT)
-        round_ = replace(round_, result=result)
+        round_ = replace(round_, result=schema.read_canonical(Result, folder / RESULT))
     return round_
 
 

@@ -305,10 +305,7 @@ def check_free(value: Any, where: str, depth: int = MAX_DEPTH) -> None:
         return
     if depth == 0:
         raise InputError(f"{where}: is nested more than {MAX_DEPTH} deep")
-    if isinstance(value, dict):
-        for key in value:
-            check_free(key, where, depth - 1)
-    for part in value.values() if isinstance(value, dict) else value:
+    for part in [*value, *value.values()] if isinstance(value, dict) else value:
         check_free(part, where, depth - 1)
 
 

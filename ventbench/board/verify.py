@@ -252,9 +252,8 @@ def _check_published(leaderboard: Store, site: Path | None, readme: Path, memo: 
         problems.append(f"{readme}: its table is not that of the board")
     if site is None:
         return problems
-    plain, _ = canonical.walk(leaderboard.folder)
-    inputs = {x: (leaderboard.folder / x).read_bytes() for x in filter(canonical.named, plain)}
-    state = tuple(sorted((name, canonical.digest(content)) for name, content in inputs.items()))
+    inputs = build.inputs(leaderboard.folder)
+    state = tuple((name, canonical.digest(content)) for name, content in inputs.items())
     expected = inputs | once(memo, ("pages", state), build.content, leaderboard)
     present, odd = canonical.walk(site)
     for name in sorted({*expected, *present, *odd}):

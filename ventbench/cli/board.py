@@ -358,10 +358,10 @@ def _stress_table(track: Track) -> Table:
     for name in ("rank", "entry", "score", "95 %", "ranks", "calm", "survived", "unsafe"):
         table.add_column(name, justify="left" if name == "entry" else "right", no_wrap=True)
     for row in rows:
-        score, place = row["score"], row["place"]
+        score, place = row["score"], row["row"].stress_place
         table.add_row(
             "" if place is None else str(place.rank),
-            row["name"],
+            row["row"].record.name,
             "failed" if score is None else score["text"],
             "" if score is None else score["small"],
             "" if place is None else f"{place.best} to {place.worst}",

@@ -103,19 +103,15 @@ def open_submission(name: str) -> Submission:
     )
     if problems:
         raise SubmissionError(*problems)
-    manifest = _manifest(folder, f"{name}/{MANIFEST}".replace("//", "/"))
-    return Submission(name.rstrip("/"), folder, manifest, combined_hash(file_hashes(folder)))
-
-
-def _manifest(folder: Path, label: str) -> Manifest:
-    """Read a manifest in a limited process."""
+    label = f"{name}/{MANIFEST}".replace("//", "/")
     try:
         answer = read_apart("ventbench.entries.manifest:read_as_json", folder, [label])
     except UnreadableError as error:
         raise SubmissionError(f"{label}: {error}") from None
     if answer["problems"]:
         raise SubmissionError(*answer["problems"])
-    return msgspec.convert(answer["manifest"], Manifest)
+    manifest = msgspec.convert(answer["manifest"], Manifest)
+    return Submission(name.rstrip("/"), folder, manifest, combined_hash(file_hashes(folder)))
 
 
 def as_submission(source: Any) -> Submission:
@@ -255,16 +251,18 @@ def with_seed(submission: Submission, seed: str, place: Path) -> Submission:
     return open_submission(str(copy))
 
 
-def _seed_problems(folder: Path) -> Iterator[tuple[str, str]]:
+def _seed_problems(folder: Path) -> Iterator[Finding]:
     """Files of seeds that are no weights of the submission, and seeds that are too many."""
+    advice = "put there only what another seed of the training changes"
     if len(seeds(folder)) > MAX_SEEDS:
-        yield SEEDS, f"has more than {MAX_SEEDS} folders"
+        yield _problem(SEEDS, f"has more than {MAX_SEEDS} folders", advice)
     for path in _walk(folder / SEEDS):
         parts = path.relative_to(folder / SEEDS).parts
         stands_for = folder.joinpath(*parts[1:])
         if not (ending(path.name) in ARRAYS and stands_for.is_file() and len(parts) > 1):
             name = path.relative_to(folder).as_posix()
-            yield name, "stands for no weights of the submission: seeds hold no code"
+            message = "stands for no weights of the submission: seeds hold no code"
+            yield _problem(name, message, advice)
 
 
 def combined_hash(hashes: dict[str, str]) -> str:
@@ -312,9 +310,7 @@ def _inventory(
         else:
             findings.append(_irregular(name, status.st_mode))
     findings += _size({name: status.st_size for name, status in regular.items()})
-    advice = "put there only what another seed of the training changes"
-    findings += [_problem(*problem, advice) for problem in _seed_problems(folder)]
-    return regular, findings
+    return regular, [*findings, *_seed_problems(folder)]
 
 
 def _problem(file: str, message: str, advice: str, *, problem: bool = True) -> Finding:

@@ -86,8 +86,8 @@ class Runs:
     #: the plants have no such signal.
     volume: Floats
     draw: Ints  #: of each cell, counted from 1; 0 without deviations, ``(n,)``.
-    #: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``; not in records.
-    plateau_error: Floats | None = None
+    #: |mean of the last 0.3 s - PIP| of the last breath, cmH2O, ``(S, L, n)``.
+    plateau_error: Floats
     #: all commands, %, ``(S, L, n, BREATHS, INSPIRATION_STEPS)``, 0 once a cell has failed; not in
     #: records.
     requested: Floats | None = None
@@ -187,7 +187,6 @@ class Runs:
         import pandas as pd
 
         s, lung, cell = (axis.ravel() for axis in np.indices(self.error.shape))
-        missing = np.full(self.error.shape, np.nan)
         return pd.DataFrame(
             {
                 "condition": np.array([c.id for c in self.conditions])[s],
@@ -198,9 +197,7 @@ class Runs:
                 "member": self.member[lung, cell],
                 "error_cmH2O": self.error.ravel(),
                 "rise_cmH2O": self.rise.ravel(),
-                "plateau_error_cmH2O": (
-                    missing if self.plateau_error is None else self.plateau_error
-                ).ravel(),
+                "plateau_error_cmH2O": self.plateau_error.ravel(),
                 "survived": self.survived.ravel(),
                 "safe": self.safe.ravel(),
                 "above_alarm_s": self.alarm_s.ravel(),
@@ -218,7 +215,7 @@ class Runs:
 
     def headline(self) -> dict[str, Any]:
         """What a table shows of an entry, as JSON values: score, rise, survival, safety, worst."""
-        worst = max(self.by_condition[1:], key=lambda row: _order(row["error_cmH2O"]))
+        worst = max(self.by_condition[1:], key=lambda row: order(row["error_cmH2O"]))
         rise = self.interval(self.over_conditions(self.rise))
         return {
             "score": number(self.score),
@@ -293,5 +290,6 @@ def _ci95(estimate: Interval) -> list[float | None]:
     return [number(estimate.low), number(estimate.high)]
 
 
-def _order(value: float | None) -> float:
+def order(value: float | None) -> float:
+    """What a JSON number is sorted by: what does not exist is the most."""
     return math.inf if value is None else value

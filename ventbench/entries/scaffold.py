@@ -123,7 +123,10 @@ def create(
             be copied.
         OSError: if it cannot be written.
     """
-    _check_name(name)
+    if not NAME.fullmatch(name):
+        raise InputError(f"name {name!r} {NAME_RULE}")
+    if name in bundled():
+        raise InputError(f"name {name!r} belongs to a submission of ventbench; choose another one")
     if family not in FAMILIES:
         hint = suggestion(family, FAMILIES)
         raise InputError(f"family {family!r} is not one of {', '.join(FAMILIES)}{hint}")
@@ -324,13 +327,6 @@ def initial_weights(family: str) -> dict[str, NDArray[np.float32]]:
     zero = np.zeros(_HIDDEN)
     arrays = {"w0": w0, "b0": zero, "w1": w1, "b1": zero, "w2": w2, "b2": b2}
     return {key: value.astype(np.float32) for key, value in arrays.items()}
-
-
-def _check_name(name: str) -> None:
-    if not NAME.fullmatch(name):
-        raise InputError(f"name {name!r} {NAME_RULE}")
-    if name in bundled():
-        raise InputError(f"name {name!r} belongs to a submission of ventbench; choose another one")
 
 
 def _template(name: str) -> str:

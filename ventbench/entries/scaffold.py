@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import os
 import re
+from collections.abc import Callable
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -52,17 +53,23 @@ _EXPORTED = """
 `weights.npz` and `network.py` give the {count} actions of `{file}` to {off:.0e}.
 """
 
-#: What may stand between layers, and behind the last one, as the copy says it. The check evaluates
-#: these texts, so that what is written is what was checked.
-ACTIVATIONS = {
-    "tanh": "np.tanh(x)",
-    "relu": "np.maximum(x, 0.0)",
-    "elu": "np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))",
-    "leaky relu": "np.maximum(x, 0.01 * x)",
-    "silu": "x / (1.0 + np.exp(-x))",
-    "sigmoid": "1.0 / (1.0 + np.exp(-x))",
+#: What may stand between layers, and behind the last one: as a function, and as numpy says it.
+ACTIVATIONS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "tanh": (np.tanh, "np.tanh(x)"),
+    "relu": (lambda x: np.maximum(x, 0.0), "np.maximum(x, 0.0)"),
+    "elu": (
+        lambda x: np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0))),
+        "np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))",
+    ),
+    "leaky relu": (lambda x: np.maximum(x, 0.01 * x), "np.maximum(x, 0.01 * x)"),
+    "silu": (lambda x: x / (1.0 + np.exp(-x)), "x / (1.0 + np.exp(-x))"),
+    "sigmoid": (lambda x: 1.0 / (1.0 + np.exp(-x)), "1.0 / (1.0 + np.exp(-x))"),
 }
-OUTPUTS = {"nothing": "x", "tanh": "np.tanh(x)", "clip": "np.clip(x, -1.0, 1.0)"}
+OUTPUTS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "nothing": (lambda x: x, "x"),
+    "tanh": (np.tanh, "np.tanh(x)"),
+    "clip": (lambda x: np.clip(x, -1.0, 1.0), "np.clip(x, -1.0, 1.0)"),
+}
 
 #: Numbers of an observation of ``ventbench/Ventilator-v1``; largest deviation of the copy.
 _OBSERVED, _TOLERANCE = 15, 1e-6
@@ -123,10 +130,7 @@ def create(
             be copied.
         OSError: if it cannot be written.
     """
-    if not NAME.fullmatch(name):
-        raise InputError(f"name {name!r} {NAME_RULE}")
-    if name in bundled():
-        raise InputError(f"name {name!r} belongs to a submission of ventbench; choose another one")
+    _check_name(name)
     if family not in FAMILIES:
         hint = suggestion(family, FAMILIES)
         raise InputError(f"family {family!r} is not one of {', '.join(FAMILIES)}{hint}")
@@ -247,8 +251,8 @@ def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, i
         x = check_input
         with np.errstate(over="ignore"):
             for k in range(depth):
-                text = ACTIVATIONS[hidden] if k < depth - 1 else OUTPUTS[last]
-                x = eval(text, {"np": np, "x": x @ arrays[f"w{k}"] + arrays[f"b{k}"]})
+                activate, _ = ACTIVATIONS[hidden] if k < depth - 1 else OUTPUTS[last]
+                x = activate(x @ arrays[f"w{k}"] + arrays[f"b{k}"])
         error = np.max(np.abs(x[:, 0] - check_output) / np.maximum(1.0, np.abs(check_output)))
         if error < deviation:
             deviation, between, behind = float(error), hidden, last
@@ -259,8 +263,8 @@ def exported(path: Path) -> tuple[dict[str, NDArray[np.floating]], str, float, i
             f"{', '.join(ACTIVATIONS)}; float64 tells rounding from another network"
         )
     code = _template("network.py").partition("def activation")
-    code = code[1] + code[2].replace(ACTIVATIONS["relu"], ACTIVATIONS[between])
-    code = code.replace("return x @ w + b", f"x = x @ w + b\n        return {OUTPUTS[behind]}")
+    code = code[1] + code[2].replace(ACTIVATIONS["relu"][1], ACTIVATIONS[between][1])
+    code = code.replace("return x @ w + b", f"x = x @ w + b\n        return {OUTPUTS[behind][1]}")
     return (
         arrays,
         _GYMNASIUM.format(frames=inputs // _OBSERVED) + code,
@@ -327,6 +331,13 @@ def initial_weights(family: str) -> dict[str, NDArray[np.float32]]:
     zero = np.zeros(_HIDDEN)
     arrays = {"w0": w0, "b0": zero, "w1": w1, "b1": zero, "w2": w2, "b2": b2}
     return {key: value.astype(np.float32) for key, value in arrays.items()}
+
+
+def _check_name(name: str) -> None:
+    if not NAME.fullmatch(name):
+        raise InputError(f"name {name!r} {NAME_RULE}")
+    if name in bundled():
+        raise InputError(f"name {name!r} belongs to a submission of ventbench; choose another one")
 
 
 def _template(name: str) -> str:

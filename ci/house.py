@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 #: Most tokens of all that is kept by hand beside the tests, and of the largest parts of it.
-LIMITS = {"sum": 484_725, "ventbench": 327_620, "hardware_eval": 59_939}
+LIMITS = {"sum": 483_621, "ventbench": 326_508, "hardware_eval": 59_939}
 
 #: What is counted together.
 PACKAGES = ("ventbench", "hardware_eval", "proofs", "benchmarks", "ci")

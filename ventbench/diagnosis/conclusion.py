@@ -130,8 +130,8 @@ def conclude(
     settings = evaluator.settings.search
     readings = evaluator.training.data.weight
     slow = judged.accepted.noise.autocorrelation_time(readings) > 1.0 / WARMTH
-    events = posterior.likely_events  # effects of some breaths are set aside before
-    if slow and settings.ventilator and not events:
+    # Effects of some breaths are set aside before.
+    if slow and settings.ventilator and not posterior.likely_events:
         tell("searching from all of a ventilator")
         white = replace(evaluator, white=True, excluded=(*evaluator.excluded, *IN_TIME))
         of_ventilator = evidence.search(replace(white, training=every), settings.ventilator)

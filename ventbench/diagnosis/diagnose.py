@@ -25,7 +25,7 @@ from ventbench.diagnosis.corrected import (
     compare_open_loop,
     correct,
 )
-from ventbench.diagnosis.evidence import IN_TIME, likeliest_sets
+from ventbench.diagnosis.evidence import IN_TIME, MUSCLES, likeliest_sets
 from ventbench.diagnosis.experiment import Experiment, Split, prepare
 from ventbench.diagnosis.experiment_design import request_breaths
 from ventbench.diagnosis.findings import (
@@ -158,7 +158,7 @@ def diagnose(
     by_flow = drive == "flow" or (drive == "auto" and flow_drive.lacks_commands(breaths))
     compilation.keep()
     experiment = prepare(breaths, simulators, settings.data, by_flow=by_flow)
-    excluded = () if patient else ("patient_effort",)
+    excluded = () if patient else MUSCLES
     if by_flow:
         excluded += (*flow_drive.ventilator_side(), *IN_TIME)
         settings = flow_drive.lung_side_settings(settings, breaths)

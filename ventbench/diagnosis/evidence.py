@@ -10,7 +10,7 @@ over all sets that were scored.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -48,7 +48,7 @@ COMMANDS = ("lost_commands", "late_commands")
 IN_TIME = frozenset({*EVENTS, *COMMANDS, *SWINGS})
 
 #: Effects of the muscles, which a test lung has not.
-MUSCLES = ("cough", "unknown:muscles")
+MUSCLES = (EFFORT, "cough", "unknown:muscles")
 
 #: Prior odds of a term, of an unknown at a place beside those of a name, and the power of the
 #: likelihood: no model has what neighbouring samples share.
@@ -84,14 +84,16 @@ class Posterior:
     fitted: tuple[Scored, ...]  #: sets that were fitted, likeliest first.
     weights: Mapping[frozenset[str], float]  #: posterior of each set of names; they add up to 1.
 
-    def marginal(self, name: str) -> float:
-        """Posterior probability that a term acts, over all sets."""
-        return float(sum(weight for names, weight in self.weights.items() if name in names))
+    def marginal(self, *names: str) -> float:
+        """Posterior probability that one of these terms acts, over all sets."""
+        return float(sum(weight for s, weight in self.weights.items() if not s.isdisjoint(names)))
 
     @property
     def likely_events(self) -> tuple[str, ...]:
-        """Effects of some breaths that may act."""
-        return tuple(n for n in (*EVENTS, *COMMANDS) if self.marginal(n) > _LOOKED_FOR)
+        """Effects of some breaths that may act; lost and late commands are one question."""
+        questions = (*((name,) for name in EVENTS), COMMANDS)
+        likely = (names for names in questions if self.marginal(*names) > _LOOKED_FOR)
+        return tuple(name for names in likely for name in names)
 
     def swaps(self, names: frozenset[str], name: str) -> dict[str, float]:
         """Posterior odds of others in the place of one term of a set, the likeliest first.
@@ -225,7 +227,7 @@ def enumerate_sets(
         same_size = [pair for key, pair in best.items() if len(key) == size]
         return [terms for _, terms in sorted(same_size, key=lambda pair: -pair[0])[:count]]
 
-    for size in range(2, most + 1):
+    for size in _sizes(best, most):
         sets = (
             [(t,) for candidates in shortlist.values() for t in candidates]
             if size == 2
@@ -240,6 +242,21 @@ def enumerate_sets(
                 for _, alternative in ranked[term.name]:
                     score((*terms[:k], alternative, *terms[k + 1 :]))
     return sorted(best.values(), key=lambda pair: -pair[0])
+
+
+def _sizes(best: Mapping[frozenset[str], tuple[float, Set]], most: int) -> Iterator[int]:
+    """Sizes of sets to score, as long as a term more made the likeliest set likelier.
+
+    Fits are extended by single terms afterwards, whatever was scored.
+    """
+    for size in range(2, most + 1):
+        fewer, last = (
+            max(value for key, (value, _) in best.items() if len(key) == n)
+            for n in (size - 2, size - 1)
+        )
+        if size > 2 and last <= fewer:
+            return
+        yield size
 
 
 def _log_posterior(scored: Scored) -> float:
@@ -273,11 +290,8 @@ class _Search:
     def __init__(self, evaluator: Evaluator) -> None:
         self.evaluator, self.settings = evaluator, evaluator.settings.search
         self.predictor = evaluator.training.predictor
-        excluded = set(evaluator.excluded)
-        if EFFORT in excluded:
-            excluded |= {*MUSCLES}
-        self.excluded = excluded
-        self.names = [n for n in library() if n not in excluded and n != EFFORT]
+        self.excluded = evaluator.excluded
+        self.names = [n for n in library() if n not in self.excluded and n != EFFORT]
         self.unnamed = self.settings.nonparametric_terms
         if self.unnamed is None:
             self.unnamed = tuple(basis_terms())
@@ -297,15 +311,14 @@ class _Search:
             views.append(self.view(self.at_label(noise), noise))
         for view in views:
             self.scatters = view.scatters
-            for terms in (
-                terms for ranking in view.ranked for _, terms in ranking[: self.settings.fits]
-            ):
+            leading = [sets for ranking in view.ranked for _, sets in ranking[: self.settings.fits]]
+            for terms in {names_of(terms): terms for terms in leading}.values():
                 self.attempt(view.around, view.noise, terms, view.base)
         main = min(views, key=lambda view: float(view.noise.log_scale(data.weight).sum()))
         around, noise, self.scatters = main.around, main.noise, main.scatters
         handled = {*self.excluded, *names_of(main.latent)}
         self.refused = [name for name in SWINGS if name not in handled]
-        self.muscles = [term for term in main.latent if term.name in (EFFORT, MUSCLES[0])]
+        self.muscles = [term for term in main.latent if term.name in MUSCLES[:-1]]
         self.scored[frozenset()] = self.score(self.linear_model(around, self.base, noise))
         self.contenders.add(frozenset())
         self.rescore(around, noise)

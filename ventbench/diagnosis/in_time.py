@@ -56,8 +56,8 @@ SWINGS = {
     "unknown:muscles": (ALVEOLUS, np.arange(0.7, 2.6, 0.1), 2, (0.4, 1.0)),
 }
 
-#: Shares of the commands that are expected to be lost, or late; samples by which they are late.
-_COMMANDS = {"lost_commands": (0.08, (None,)), "late_commands": (0.18, (2, 3, 4))}
+#: Samples by which commands may be late; share of them that is tried first.
+_COMMANDS, _FIRST_SHARE = {"lost_commands": (None,), "late_commands": (2, 3, 4)}, 0.1
 
 #: Permutations of breaths, and p-value from which commands do not predict which are affected.
 _PERMUTATIONS, EXCHANGEABLE = 2000, 0.01
@@ -69,8 +69,8 @@ INPUT_ERROR = 0.1
 _PATHS, _SAME = 6, 0.3
 
 
-def _share(n: int, k: int) -> float:
-    """Log prior of k affected breaths of n, whose share is uniform."""
+def _share(n: float, k: float) -> float:
+    """Log prior of k affected breaths, or commands, of n, whose share is uniform."""
     return float(special.betaln(k + 1, n - k + 1))
 
 
@@ -297,21 +297,23 @@ def _likeliest_swing(
 def _commands(model: LinearModel, partition: Partition, around: FittedModel) -> list[Term]:
     """Lost and late commands."""
     data, values, terms = partition.data, model.around.values, []
-    problem, x, share = replace(around.problem, noise=model.noise), around.minimum.x, 0.1
-    for name, (expected, lags) in _COMMANDS.items():
-        candidates = [follow(problem, x, partition, share, lag) for lag in lags]
-        nats = np.array([paths.nats.sum() for paths in candidates])
-        best = candidates[int(np.argmax(nats))]
-        missed, sent = float(best.missed.sum()), float(best.sent.sum())
+    problem, x = replace(around.problem, noise=model.noise), around.minimum.x
+    for name, lags in _COMMANDS.items():
+        share = _FIRST_SHARE
+        for _ in range(2):  # a share that is too large takes noise for losses
+            candidates = [follow(problem, x, partition, share, lag) for lag in lags]
+            nats = np.array([paths.nats.sum() for paths in candidates])
+            best = candidates[int(np.argmax(nats))]
+            missed, sent = float(best.missed.sum()), float(best.sent.sum())
+            sent = max(sent, missed)  # a valve that waits counts at every sample
+            share = (missed + 1.0) / (sent + 2.0)
         if not missed or ask_for_little(best, data.u_in) <= EXCHANGEABLE:
             break
-        share = min(missed / sent, 0.5)  # a valve that waits counts at every sample
         reached = partition.predictor.of(replace(data, u_in=best.u_in))
         column = reached.predict(values)[:, 0] - partition.predictor.predict(values)[:, 0]
-        odds = missed * np.log(share) + max(sent - missed, 0.0) * np.log1p(-share)
-        odds -= 0.5 * (np.log(share / expected) / 0.5) ** 2
-        odds += np.logaddexp.reduce(nats - nats.max()) - np.log(len(lags))  # whatever the delay
-        terms.append(Term(name, [1.0], odds=float(odds), latent=[column]))
+        delay = np.logaddexp.reduce(nats - nats.max()) - np.log(len(lags))  # whatever it is
+        odds = _share(sent, missed) + float(delay)
+        terms.append(Term(name, [1.0], odds=odds, latent=[column]))
     return terms
 
 

@@ -35,7 +35,8 @@ from ventbench.diagnosis.evidence import COMMANDS
 from ventbench.diagnosis.findings import MissingMechanism
 from ventbench.diagnosis.hypothesis import FittedModel, Partition, linearise
 from ventbench.diagnosis.identification import IdentifiedModel
-from ventbench.diagnosis.in_time import EXCHANGEABLE, Paths, command_p_value, follow
+from ventbench.diagnosis.in_time import EXCHANGEABLE, Paths, ask_for_little, command_p_value, follow
+from ventbench.diagnosis.linearised import OPEN
 from ventbench.diagnosis.unknown import explained, mixture, preference, unplaced_gain
 from ventbench.diagnosis.validation import order_p_value
 from ventbench.mechanics.labels import Estimate
@@ -119,13 +120,18 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     """
     evaluator, conclusion = model.evaluator, model.conclusion
     hypothesis, likely = conclusion.named.hypothesis, conclusion.posterior.likely_events
+    if not likely and conclusion.unnamed is None and not conclusion.names:
+        likely = COMMANDS  # rare ones may be in none of the breaths that were searched
     if not likely:
         return None
     rest = hypothesis.minus(*hypothesis.breath_terms)
     alone = fit_with_noise(evaluator, rest, conclusion.named)  # which has the place of a change
-    names = [name for name in likely if name not in COMMANDS]
+    names = {name for name in likely if name not in COMMANDS}
+    # An open tube is far from linear, so that the search may take it for another event.
     candidates = [
-        candidate for name in names if (candidate := _fit(evaluator, alone, name)) is not None
+        candidate
+        for name in sorted(names | {OPEN} if names else ())
+        if (candidate := _fit(evaluator, alone, name)) is not None
     ]
     if len(names) < len(likely):
         candidates += _fit_commands(evaluator, alone)
@@ -286,6 +292,8 @@ def _everywhere(
     partition = evaluator.partition(data)
     if name in COMMANDS:
         paths = _paths(evaluator, candidate.fitted, partition, candidate.share, candidate.strength)
+        if ask_for_little(paths, data.u_in) <= EXCHANGEABLE:
+            return np.zeros(len(data), bool), None, {}
         missed, sent = int(paths.missed.sum()), max(int(paths.sent.sum()), 1)
         p, width = missed / sent, 1.96 * np.sqrt(missed + 1.0) / sent
         estimates = {"share": Estimate(p, "1", (max(p - width, 0.0), min(p + width, 1.0)))}

@@ -90,8 +90,10 @@ def gaussian(G: Floats, b: Floats, sd: Floats) -> tuple[float, Floats, Floats]:
         b: ``X' K^-1 y``, ``(k,)``.
         sd: prior standard deviations, ``(k,)``.
     """
-    L = cholesky(np.eye(len(sd)) + sd[:, None] * G * sd)
-    root = solve_lower(L, np.diag(sd))
+    precision = np.multiply(sd[:, None] * G, sd)
+    precision.flat[:: len(sd) + 1] += 1.0
+    L, failed = lapack.dpotrf(precision, lower=1)  # type: ignore[attr-defined]
+    root = solve_lower(cholesky(precision) if failed else L, np.diag(sd))
     q = root @ b
     mean, sds = root.T @ q, np.sqrt(np.sum(root**2, axis=0))
     return 0.5 * float(q @ q) - float(np.log(np.diag(L)).sum()), mean, sds

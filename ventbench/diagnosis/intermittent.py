@@ -126,7 +126,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
         return None
     rest = hypothesis.minus(*hypothesis.breath_terms)
     alone = fit_with_noise(evaluator, rest, conclusion.named)  # which has the place of a change
-    names = {name for name in likely if name not in COMMANDS}
+    names = {*likely} - {*COMMANDS}
     # An open tube is far from linear, so that the search may take it for another event.
     candidates = [
         candidate
@@ -162,7 +162,7 @@ def find(model: IdentifiedModel, data: Data, ids: NDArray[np.int_]) -> Intermitt
     missing = MissingMechanism(
         best.name,
         estimates,
-        odds[best.name] / sum(odds.values()) * preference(total - unplaced),
+        odds[best.name] / sum(odds.values()) * preference(min(total - unplaced, gained)),
         tuple(name for name, value in odds.items() if value > least_odds and name != best.name),
         gained,
         worth=worth,
